@@ -22,7 +22,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 .PHONY: study test lint clean-venv
 
 study: $(VENV)/.installed-core
-	$(PY) -m olympics_opt.cli study high_jump --out $(OUT)
+	$(VENV)/bin/olympics-opt study high_jump --out $(OUT)
 
 test: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(PY) -m pytest -q -n $(WORKERS) --dist loadfile -m "not slow" \
