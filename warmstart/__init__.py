@@ -1,0 +1,1 @@
+"""Where good motions come from: trajectory optimisation, clips and their certificates."""
