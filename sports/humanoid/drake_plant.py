@@ -286,15 +286,18 @@ def add_humanoid(plant: MultibodyPlant, body: Body, name: str = "athlete") -> Dr
         if plant.time_step() > 0:
             actuator.set_controller_gains(PdControllerGains(p=dof.kp, d=0.0))
         actuators.append(actuator)
-    points, shapes = _add_geometry(plant, body, links)
+    geometry = [
+        add_shapes(plant, links[link.name], link.name, link.shapes, contact_properties())
+        for link in body.links
+    ]
     return DrakeHumanoid(
         body=body,
         instance=instance,
         links=tuple(links[link.name] for link in body.links),
         joints=tuple(joints[dof.name] for dof in body.dofs),
         actuators=tuple(actuators),
-        points=points,
-        shapes=shapes,
+        points=tuple(points for points, _ in geometry),
+        shapes=tuple(shapes for _, shapes in geometry),
     )
 
 
@@ -302,56 +305,59 @@ def _offset_frame(name: str, parent: RigidBody, offset: Sequence[float]) -> Fixe
     return FixedOffsetFrame(name, parent.body_frame(), RigidTransform(np.asarray(offset)))
 
 
-def _add_geometry(
-    plant: MultibodyPlant, body: Body, links: dict[str, RigidBody]
-) -> tuple[tuple[tuple[GeometryId, ...], ...], tuple[tuple[GeometryId, ...], ...]]:
+def add_shapes(
+    plant: MultibodyPlant,
+    rigid: RigidBody,
+    name: str,
+    shapes: Iterable[Shape],
+    properties: ProximityProperties,
+    ground: bool = True,
+) -> tuple[tuple[GeometryId, ...], tuple[GeometryId, ...]]:
+    """Register shapes on a body: (points for the ground, none if not ``ground``; true shapes).
+
+    Nothing is registered, and both are empty, when the plant has no SceneGraph.
+    """
     if not plant.geometry_source_is_registered():
         return (), ()
-    properties = contact_properties()
-    points, shapes = [], []
-    for link in body.links:
-        rigid = links[link.name]
-        link_points, link_shapes = [], []
-        for i, shape in enumerate(link.shapes):
-            X_LS, geometry = drake_shape(shape)
-            link_shapes.append(
+    points: list[GeometryId] = []
+    solids: list[GeometryId] = []
+    for i, shape in enumerate(shapes):
+        X_LS, geometry = drake_shape(shape)
+        solids.append(
+            plant.RegisterCollisionGeometry(rigid, X_LS, geometry, f"{name}_shape{i}", properties)
+        )
+        for k, (p_LoS_L, radius) in enumerate(support_points(shape) if ground else ()):
+            points.append(
                 plant.RegisterCollisionGeometry(
-                    rigid, X_LS, geometry, f"{link.name}_shape{i}", properties
+                    rigid,
+                    RigidTransform(p_LoS_L),
+                    Sphere(max(radius, POINT_RADIUS)),
+                    f"{name}_point{i}_{k}",
+                    properties,
                 )
             )
-            for k, (p_LoS_L, radius) in enumerate(support_points(shape)):
-                link_points.append(
-                    plant.RegisterCollisionGeometry(
-                        rigid,
-                        RigidTransform(p_LoS_L),
-                        Sphere(max(radius, POINT_RADIUS)),
-                        f"{link.name}_point{i}_{k}",
-                        properties,
-                    )
-                )
-        points.append(tuple(link_points))
-        shapes.append(tuple(link_shapes))
-    return tuple(points), tuple(shapes)
+    return tuple(points), tuple(solids)
 
 
 def filter_collisions(
     scene_graph: SceneGraph,
     humanoids: Sequence[DrakeHumanoid],
     ground: Iterable[GeometryId] = (),
-    others: Iterable[GeometryId] = (),
+    object_points: Iterable[GeometryId] = (),
+    object_shapes: Iterable[GeometryId] = (),
 ) -> None:
     """Explicit filters: points meet ``ground`` only, shapes everything but ``ground``.
 
-    ``others`` are the geometries of fixtures and objects. Shapes of one link, and of the pairs
-    in ``body.excluded_pairs``, never meet; different athletes do. The massless bodies between
-    two links defeat Drake's own adjacent-body filter, so nothing is left to it.
+    Shapes of one link, and of the pairs in ``body.excluded_pairs``, never meet; different
+    athletes do, and so do athletes and objects. The massless bodies between two links defeat
+    Drake's own adjacent-body filter, so nothing is left to it.
     """
-    points = [g for h in humanoids for link in h.points for g in link]
-    shapes = [g for h in humanoids for link in h.shapes for g in link]
+    points = [g for h in humanoids for link in h.points for g in link] + list(object_points)
+    shapes = [g for h in humanoids for link in h.shapes for g in link] + list(object_shapes)
     ground = list(ground)
     declare = CollisionFilterDeclaration()
     declare.ExcludeWithin(GeometrySet(points))
-    declare.ExcludeBetween(GeometrySet(points), GeometrySet([*shapes, *others]))
+    declare.ExcludeBetween(GeometrySet(points), GeometrySet(shapes))
     declare.ExcludeBetween(GeometrySet(shapes), GeometrySet(ground))
     for humanoid in humanoids:
         body = humanoid.body

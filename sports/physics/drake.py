@@ -1,0 +1,357 @@
+"""Drake: the independent engine that says whether a result is a property of the motion.
+
+One plant, one diagram, one context per world; worlds are stepped one after another in this
+process (run several processes for speed: a plant is not shared between threads). The time step
+is finer than MuJoCo's (at most 1/480 s) and the contact model is another one: compliant points
+with Hunt-Crossley damping in Drake's convex solver, which is what makes agreement mean something.
+
+Athletes come from :mod:`sports.humanoid.drake_plant`. Fixtures (``fixed`` and ``mocap``) are
+welded to the world through a frame whose pose is a parameter of the context, so that each world
+has its own; their velocity is zero, as it is for a mocap body in MuJoCo. ``solref`` of an object
+is a MuJoCo number and has no meaning here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.geometry import GeometryId
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, RigidBody
+from pydrake.systems.framework import Context
+from torch import Tensor
+
+from sports.humanoid.drake_plant import (
+    DrakeHumanoid,
+    add_ground,
+    add_humanoid,
+    add_shapes,
+    contact_properties,
+    filter_collisions,
+    link_inertia,
+    rotate,
+    start_plant,
+)
+from sports.physics.base import Geometry, PhysicsState, diverged
+from sports.scene import Scene, SceneObject
+
+MAX_TIMESTEP = 1.0 / 480.0
+"""Largest time step (s) chosen on its own: standing joints then follow MuJoCo to 1e-3 rad."""
+
+
+@dataclass(frozen=True)
+class _Object:
+    """A free object or a fixture in the plant."""
+
+    name: str
+    rigid: RigidBody
+    frame: FixedOffsetFrame | None
+    """Frame F of a fixture, whose X_WF is a context parameter; None for a free object."""
+    quat: tuple[float, float, float, float]
+
+
+class DrakePhysics:
+    """The ``drake`` engine; see :class:`sports.physics.base.Physics` for the tensors.
+
+    ``timestep`` (s) must divide the scene's control time step; None takes the scene's time step
+    divided by the smallest whole number that brings it to 1/480 s or below. Raises ValueError
+    for a time step that does not divide.
+    """
+
+    engine = "drake"
+
+    def __init__(
+        self,
+        scene: Scene,
+        num_worlds: int,
+        timestep: float | None = None,
+        contact_approximation: str = "lagged",
+    ) -> None:
+        self.scene = scene
+        self.num_worlds = n = num_worlds
+        self.device = torch.device("cpu")
+        self.geometry = Geometry(scene.body, self.device)
+        self.substeps = _substeps(scene, timestep)
+        self.timestep = scene.control_timestep / self.substeps
+
+        builder, plant, scene_graph = start_plant(self.timestep, contact_approximation)
+        self.plant = plant
+        ground = add_ground(plant, scene.ground_friction)
+        self._humanoids = [
+            add_humanoid(plant, scene.body, f"agent{a}") for a in range(scene.num_agents)
+        ]
+        points: list[GeometryId] = []
+        shapes: list[GeometryId] = []
+        self._free: list[_Object] = []
+        self._fixtures: list[_Object] = []
+        for obj in scene.objects:
+            added = _add_object(plant, obj, points, shapes)
+            (self._fixtures if added.frame is not None else self._free).append(added)
+        plant.Finalize()
+        filter_collisions(scene_graph, self._humanoids, [ground], points, shapes)
+        self.diagram = builder.Build()
+        self._roots = [self.diagram.CreateDefaultContext() for _ in range(n)]
+        self._contexts = [plant.GetMyMutableContextFromRoot(root) for root in self._roots]
+        self._contact_port = plant.get_contact_results_output_port()
+        self._targets = [plant.get_desired_state_input_port(h.instance) for h in self._humanoids]
+        self._mocap_rows = {o.name: k for k, o in enumerate(scene.mocap_objects)}
+        self._index_contacts()
+
+        agents, links, free = scene.num_agents, scene.body.num_links, len(self._free)
+        self._links = [link for h in self._humanoids for link in h.links]
+        self._q = np.zeros((n, plant.num_positions()))
+        self._v = np.zeros((n, plant.num_velocities()))
+        self._mocap = np.zeros((n, len(self._mocap_rows), 3))
+        bodies = agents * links + free
+        self._pos, self._quat = np.zeros((n, bodies, 3)), np.zeros((n, bodies, 4))
+        self._lin, self._ang = np.zeros((n, bodies, 3)), np.zeros((n, bodies, 3))
+        self._ground = np.zeros((n, agents * links, 3))
+        self._pair = np.zeros((n, len(scene.contact_pairs)))
+        self.bad = torch.zeros(n, dtype=torch.bool)
+        self.nan_worlds = 0
+        self.overflow = 0  # Drake has no contact buffers to overflow.
+        self._qpos0 = scene.default_qpos()
+        self._mocap0 = scene.default_mocap_pos()
+        for world in range(n):
+            self._place(world, self._qpos0, np.zeros(scene.nv), self._mocap0)
+        self._publish()
+
+    def step(self, ctrl: Tensor) -> None:
+        targets = ctrl.detach().cpu().numpy().astype(float)
+        if targets.shape != (self.num_worlds, self.scene.nu):
+            raise ValueError(
+                f"ctrl must be ({self.num_worlds}, {self.scene.nu}), not {targets.shape}"
+            )
+        self.bad = torch.zeros(self.num_worlds, dtype=torch.bool)
+        for world in range(self.num_worlds):
+            if not self._step_world(world, targets[world]):
+                self.bad[world] = True
+        self._read_states()
+        self.bad |= diverged(self.qpos, self.qvel)
+        if self.bad.any():
+            self.nan_worlds += int(self.bad.sum())
+            for world in torch.nonzero(self.bad).ravel().tolist():
+                self._place(world, self._qpos0, np.zeros(self.scene.nv), self._mocap[world])
+        self._publish()
+
+    def reset(self, mask: Tensor, state: PhysicsState) -> None:
+        qpos, qvel = state.qpos.double().cpu().numpy(), state.qvel.double().cpu().numpy()
+        mocap = state.mocap_pos.double().cpu().numpy()
+        for world in torch.nonzero(mask).ravel().tolist():
+            self._place(world, qpos[world], qvel[world], mocap[world])
+        self._publish()
+
+    def extent(self, direction: Tensor) -> Tensor:
+        return self.geometry.extent(self.body_pos, self.body_quat, direction)
+
+    def close(self) -> None:
+        self._contexts, self._roots = [], []
+
+    # ---- one world ------------------------------------------------------------------------
+
+    def _step_world(self, world: int, targets: np.ndarray) -> bool:
+        """Advances one control step; False if the solver failed or the state is not finite."""
+        self._ground[world] = 0.0
+        self._pair[world] = 0.0
+        if not np.isfinite(targets).all():
+            return False
+        root, context = self._roots[world], self._contexts[world]
+        n = self.scene.body.num_dofs
+        for a, port in enumerate(self._targets):
+            wanted = np.zeros(2 * n)
+            wanted[:n] = targets[a * n : (a + 1) * n]
+            port.FixValue(context, wanted)
+        for _ in range(self.substeps):
+            try:
+                self.diagram.ExecuteForcedEvents(root, publish=False)
+            except RuntimeError:  # the contact solver or a NaN check gave up on this world
+                return False
+            self._collect_contacts(world, context)
+        return bool(np.isfinite(self.plant.GetPositionsAndVelocities(context)).all())
+
+    def _place(self, world: int, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
+        """Sets one world's state and fixtures; contact forces become zero."""
+        scene, context = self.scene, self._contexts[world]
+        q, v = np.zeros(self.plant.num_positions()), np.zeros(self.plant.num_velocities())
+        for a, humanoid in enumerate(self._humanoids):
+            q[humanoid.q_index], v[humanoid.v_index] = humanoid.to_drake(
+                qpos[scene.agent_qpos(a)], qvel[scene.agent_qvel(a)]
+            )
+        for obj in self._free:
+            p, quat = np.split(qpos[scene.object_qpos(obj.name)], [3])
+            linear, spin = np.split(qvel[scene.object_qvel(obj.name)], [3])
+            quat = quat / np.linalg.norm(quat)
+            start, start_v = _floating(obj.rigid)
+            q[start : start + 7] = (*quat, *p)
+            v[start_v : start_v + 6] = (*rotate(quat, spin), *linear)
+        self.plant.SetPositions(context, q)
+        self.plant.SetVelocities(context, v)
+        for obj in self._fixtures:
+            row = self._mocap_rows.get(obj.name)
+            if row is not None and obj.frame is not None:
+                X_WF = RigidTransform(Quaternion(np.array(obj.quat)), mocap[row])
+                obj.frame.SetPoseInParentFrame(context, X_WF)
+        self._mocap[world] = mocap
+        self._ground[world] = 0.0
+        self._pair[world] = 0.0
+
+    def _index_contacts(self) -> None:
+        """Tables from Drake's body indices to links and to the scene's pairs."""
+        names: dict[str, list[int]] = {}
+        self._link_of: dict[int, int] = {}
+        for a, humanoid in enumerate(self._humanoids):
+            for i, link in enumerate(humanoid.links):
+                index = int(link.index())
+                self._link_of[index] = a * self.scene.body.num_links + i
+                names.setdefault(f"agent{a}", []).append(index)
+                names[f"agent{a}/{self.scene.body.link_names[i]}"] = [index]
+        for obj in [*self._free, *self._fixtures]:
+            names[obj.name] = [int(obj.rigid.index())]
+        self._pairs_of: dict[tuple[int, int], list[tuple[int, float]]] = {}
+        for k, (left, right) in enumerate(self.scene.contact_pairs):
+            for side in (left, right):
+                if side not in names:
+                    raise ValueError(f"scene '{self.scene.name}' has no contact side '{side}'")
+            for i in names[left]:
+                for j in names[right]:
+                    self._pairs_of.setdefault((i, j), []).append((k, -1.0))
+                    self._pairs_of.setdefault((j, i), []).append((k, 1.0))
+
+    def _collect_contacts(self, world: int, context: Context) -> None:
+        """Keeps, per link and per pair, the largest net force of the substeps."""
+        results = self._contact_port.Eval(context)
+        count = results.num_point_pair_contacts()
+        if count == 0:
+            return
+        ground: dict[int, np.ndarray] = {}
+        pairs: dict[int, np.ndarray] = {}
+        for i in range(count):
+            info = results.point_pair_contact_info(i)
+            body_a, body_b = int(info.bodyA_index()), int(info.bodyB_index())
+            f_Bc_W = info.contact_force()
+            if body_a == 0 and body_b in self._link_of:
+                link = self._link_of[body_b]
+                ground[link] = ground.get(link, 0.0) + f_Bc_W
+            elif body_b == 0 and body_a in self._link_of:
+                link = self._link_of[body_a]
+                ground[link] = ground.get(link, 0.0) - f_Bc_W
+            for k, sign in self._pairs_of.get((body_a, body_b), ()):
+                pairs[k] = pairs.get(k, 0.0) + sign * f_Bc_W
+        kept = self._ground[world]
+        for link, force in ground.items():
+            if force @ force > kept[link] @ kept[link]:
+                kept[link] = force
+        for k, force in pairs.items():
+            self._pair[world, k] = np.maximum(self._pair[world, k], np.linalg.norm(force))
+
+    # ---- tensors --------------------------------------------------------------------------
+
+    def _read_states(self) -> None:
+        """qpos and qvel of every world in MuJoCo's convention, float32."""
+        scene, plant = self.scene, self.plant
+        for world, context in enumerate(self._contexts):
+            self._q[world] = plant.GetPositions(context)
+            self._v[world] = plant.GetVelocities(context)
+        qpos = np.zeros((self.num_worlds, scene.nq))
+        qvel = np.zeros((self.num_worlds, scene.nv))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            for a, humanoid in enumerate(self._humanoids):
+                qpos[:, scene.agent_qpos(a)], qvel[:, scene.agent_qvel(a)] = humanoid.from_drake(
+                    self._q[:, humanoid.q_index], self._v[:, humanoid.v_index]
+                )
+            for obj in self._free:
+                start, start_v = _floating(obj.rigid)
+                quat = self._q[:, start : start + 4]
+                quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
+                w_W = self._v[:, start_v : start_v + 3]
+                w_B = rotate(quat * np.array([1.0, -1.0, -1.0, -1.0]), w_W)
+                p_WB, v_WB = (
+                    self._q[:, start + 4 : start + 7],
+                    self._v[:, start_v + 3 : start_v + 6],
+                )
+                qpos[:, scene.object_qpos(obj.name)] = np.concatenate([p_WB, quat], axis=-1)
+                qvel[:, scene.object_qvel(obj.name)] = np.concatenate([v_WB, w_B], axis=-1)
+        self.qpos = torch.from_numpy(qpos.astype(np.float32))
+        self.qvel = torch.from_numpy(qvel.astype(np.float32))
+
+    def _publish(self) -> None:
+        """Brings every tensor of the protocol up to date with the contexts."""
+        self._read_states()
+        plant, n = self.plant, self.num_worlds
+        rigids = [*self._links, *(obj.rigid for obj in self._free)]
+        for world, context in enumerate(self._contexts):
+            for i, rigid in enumerate(rigids):
+                X_WB = plant.EvalBodyPoseInWorld(context, rigid)
+                V_WB = plant.EvalBodySpatialVelocityInWorld(context, rigid)
+                self._pos[world, i] = X_WB.translation()
+                self._quat[world, i] = X_WB.rotation().ToQuaternion().wxyz()
+                self._lin[world, i] = V_WB.translational()
+                self._ang[world, i] = V_WB.rotational()
+        agents, links = self.scene.num_agents, self.scene.body.num_links
+        k = agents * links
+
+        def tensor(values: np.ndarray) -> Tensor:
+            return torch.from_numpy(values.astype(np.float32))
+
+        pos, quat = tensor(self._pos), tensor(self._quat)
+        lin, ang = tensor(self._lin), tensor(self._ang)
+        self.body_pos, self.object_pos = pos[:, :k].view(n, agents, links, 3), pos[:, k:]
+        self.body_quat, self.object_quat = quat[:, :k].view(n, agents, links, 4), quat[:, k:]
+        self.body_linvel, self.object_linvel = lin[:, :k].view(n, agents, links, 3), lin[:, k:]
+        self.body_angvel, self.object_angvel = ang[:, :k].view(n, agents, links, 3), ang[:, k:]
+        self.mocap_pos = tensor(self._mocap)
+        self.ground_force = tensor(self._ground).view(n, agents, links, 3)
+        self.pair_force = tensor(self._pair)
+
+
+def _substeps(scene: Scene, timestep: float | None) -> int:
+    """Drake steps in one control step."""
+    if timestep is None:
+        return scene.substeps * math.ceil(scene.timestep / MAX_TIMESTEP - 1e-9)
+    count = round(scene.control_timestep / timestep) if timestep > 0 else 0
+    if count < 1 or abs(count * timestep - scene.control_timestep) > 1e-9:
+        raise ValueError(
+            f"the Drake time step must divide the control time step "
+            f"{scene.control_timestep:.6g} s, which {timestep:.6g} s does not"
+        )
+    return count
+
+
+def _add_object(
+    plant: MultibodyPlant,
+    obj: SceneObject,
+    points: list[GeometryId],
+    shapes: list[GeometryId],
+) -> _Object:
+    """Adds a scene object; its geometries are appended to ``points`` and ``shapes``."""
+    instance = plant.AddModelInstance(obj.name)
+    rigid = plant.AddRigidBody(obj.name, instance, link_inertia(obj.shapes))
+    frame = None
+    if obj.motion != "free":
+        X_WF = RigidTransform(Quaternion(np.array(obj.quat, dtype=float)), np.array(obj.pos))
+        frame = plant.AddFrame(FixedOffsetFrame(f"{obj.name}_fixture", plant.world_frame(), X_WF))
+        plant.WeldFrames(frame, rigid.body_frame())
+    own = add_shapes(
+        plant,
+        rigid,
+        obj.name,
+        obj.shapes,
+        contact_properties(obj.friction),
+        ground=obj.motion == "free" and obj.meets_ground,
+    )
+    points.extend(own[0])
+    shapes.extend(own[1])
+    return _Object(obj.name, rigid, frame, obj.quat)
+
+
+def _floating(rigid: RigidBody) -> tuple[int, int]:
+    """Where a free body's quaternion starts in q and its angular velocity in v."""
+    return rigid.floating_positions_start(), rigid.floating_velocities_start_in_v()
+
+
+__all__ = ["MAX_TIMESTEP", "DrakeHumanoid", "DrakePhysics"]
