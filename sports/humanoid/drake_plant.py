@@ -223,8 +223,8 @@ def contact_properties(
     """Point contact properties: Coulomb coefficient, stiffness (N/m), dissipation (s/m)."""
     properties = ProximityProperties()
     properties.AddProperty("material", "coulomb_friction", CoulombFriction(friction, friction))
-    properties.AddProperty("material", "point_contact_stiffness", stiffness)
-    properties.AddProperty("material", "hunt_crossley_dissipation", dissipation)
+    properties.AddProperty("material", "point_contact_stiffness", float(stiffness))
+    properties.AddProperty("material", "hunt_crossley_dissipation", float(dissipation))
     return properties
 
 

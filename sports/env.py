@@ -1,0 +1,345 @@
+"""The batched environment: a task's rules on an engine's physics, with automatic resets.
+
+Nothing in a step waits for the device: resets are masked, counters are tensors. All randomness
+comes from one generator, so a seed decides every start.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sports.frames import Heading, proprioception, proprioception_slices
+from sports.humanoid.body import Limits, Strength, load_body
+from sports.physics import Geometry, Physics, PhysicsState, default_state, make_physics
+from sports.registry import get_task, make_config
+from sports.scene import Scene
+from sports.task import Memory, Task, View
+
+START_NOISE = 0.02
+"""Joint noise of a training start (rad), uniform."""
+
+
+@dataclass
+class Starts:
+    """Frames of demonstrations from which episodes may start (reference-state initialisation)."""
+
+    qpos: Tensor
+    """(F, 7 + num_dofs) of one athlete, task world."""
+    qvel: Tensor
+    """(F, 6 + num_dofs)"""
+    context: dict[str, Tensor]
+    """(F,) labels of the frame's demonstration that the task understands (``bar_height``)."""
+    probability: float = 0.5
+    """Share of resets that start from a frame."""
+
+    def to(self, device: torch.device | str) -> Starts:
+        """The same frames on a device."""
+        context = {k: v.to(device) for k, v in self.context.items()}
+        return Starts(self.qpos.to(device), self.qvel.to(device), context, self.probability)
+
+
+@dataclass
+class StepResult:
+    """What a step returns. N worlds, A agents."""
+
+    obs: Tensor
+    """(N, A, obs) after the automatic reset."""
+    final_obs: Tensor
+    """(N, A, obs) before it: the state to bootstrap a truncation from."""
+    reward: Tensor
+    """(N, A), unscaled."""
+    terms: dict[str, Tensor]
+    """Reward terms by name, (N, A)."""
+    terminated: Tensor
+    """(N,) bool: the sport ended the episode; no bootstrap."""
+    truncated: Tensor
+    """(N,) bool: the time limit ended it; bootstrap."""
+    valid: Tensor
+    """(N,) bool: false where the engine diverged; mask the sample, the world is already reset."""
+    remaining_paid: Tensor
+    """(N,) steps for which this step's reward is paid on (0 for most)."""
+    metrics: dict[str, Tensor]
+    """(N,) episode metrics, to be read where the episode ended."""
+
+
+class Env:
+    """N worlds of one task on one engine. Use :func:`make_env`."""
+
+    def __init__(
+        self,
+        task: Task,
+        config: Any,
+        physics: Physics,
+        *,
+        seed: int = 0,
+        training: bool = True,
+        starts: Starts | None = None,
+    ) -> None:
+        self.task, self.config, self.physics = task, config, physics
+        self.training = training
+        scene = physics.scene
+        self.num_worlds, self.num_agents = physics.num_worlds, scene.num_agents
+        self.device = physics.device
+        self.reward_scale, self.max_steps = task.reward_scale, task.max_steps
+        self.metric_names = tuple(task.metrics)
+        self.starts = starts.to(self.device) if starts is not None else None
+        self.generator = torch.Generator(self.device)
+        self.generator.manual_seed(seed)
+        body = scene.body
+        self.action_size = body.num_dofs
+        self.action_scale = torch.tensor(
+            body.action_scale(), dtype=torch.float32, device=self.device
+        )
+        foot = [link.name.endswith(("Ankle", "Toe")) for link in body.links]
+        n = self.num_worlds
+        self.age = torch.zeros(n, dtype=torch.long, device=self.device)
+        """Steps counted towards truncation."""
+        self.memory: Memory = {}
+        self.view = View(
+            physics=physics,
+            geometry=Geometry(body, self.device),
+            config=config,
+            curriculum=task.curriculum(config, n, self.device) if task.curriculum else {},
+            clock=torch.zeros(n, dtype=torch.long, device=self.device),
+            heading=Heading(physics.body_quat[:, :, 0]),
+            control_timestep=scene.control_timestep,
+            foot_links=torch.tensor(foot, device=self.device),
+            head_index=body.link_index("Head"),
+        )
+        self._default = default_state(scene, n, self.device)
+        self.final_snapshot: dict[str, Tensor] = {}
+        """State before the automatic reset of the last step, filled if ``keep_snapshot``."""
+        self.keep_snapshot = False
+        self.obs_slices: dict[str, slice] = {}
+        obs = self.reset()
+        self.obs_size = obs.shape[-1]
+
+    @property
+    def curriculum(self) -> Memory:
+        """Curriculum state by name, (N,) tensors; empty for a task without one."""
+        return self.view.curriculum
+
+    def reset(self) -> Tensor:
+        """Resets every world; (N, A, obs)."""
+        everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
+        self._reset(everyone)
+        if self.training and self.task.age_at_start:
+            # Once, so that worlds do not all reach the time limit together.
+            draw = torch.rand(self.num_worlds, device=self.device, generator=self.generator)
+            self.age = (draw * self.max_steps).long()
+        return self._observe()
+
+    def step(self, action: Tensor) -> StepResult:
+        """One control step of (N, A, act) actions in [-1, 1] (clipped here).
+
+        Raises ValueError for an action of another shape.
+        """
+        if action.shape != (self.num_worlds, self.num_agents, self.action_size):
+            raise ValueError(
+                f"action has shape {tuple(action.shape)}, expected "
+                f"{(self.num_worlds, self.num_agents, self.action_size)}"
+            )
+        ctrl = action.to(torch.float32).clamp(-1.0, 1.0) * self.action_scale
+        self.physics.step(ctrl.flatten(1))
+        self.view.clock = self.view.clock + 1
+        self.age = self.age + 1
+        self.view.heading = Heading(self.physics.body_quat[:, :, 0])
+
+        step = self.task.advance(self.view, self.memory)
+        self.memory = step.memory
+        bad = self.physics.bad
+        zero = torch.zeros((), device=self.device)
+        terms = {k: torch.where(bad[:, None], zero, v) for k, v in step.terms.items()}
+        reward = torch.stack(tuple(terms.values())).sum(0)
+        terminated = step.terminated & ~bad
+        truncated = (self.age >= self.max_steps) & ~terminated & ~bad
+        ended = terminated | truncated | bad
+        final_obs = self._observe()
+        if self.keep_snapshot:
+            self.final_snapshot = self.snapshot()
+        remaining = torch.zeros(self.num_worlds, device=self.device)
+        if step.remaining_paid is not None:
+            left = (self.max_steps - self.view.clock).clamp(min=0).float()
+            remaining = torch.where(step.remaining_paid & terminated, left, remaining)
+        if self.task.promote is not None:
+            ended_well = (terminated | truncated) & ~bad
+            self.view.curriculum = self.task.promote(self.view, self.memory, step, ended_well)
+
+        obs = final_obs
+        # On a CPU asking costs nothing and saves the work; on a GPU it would wait.
+        if self.device.type != "cpu" or bool(ended.any()):
+            self._reset(ended)
+            obs = self._observe()
+        return StepResult(
+            obs=obs,
+            final_obs=final_obs,
+            reward=reward,
+            terms=terms,
+            terminated=terminated,
+            truncated=truncated,
+            valid=~bad,
+            remaining_paid=remaining,
+            metrics=step.metrics,
+        )
+
+    def _reset(self, mask: Tensor) -> None:
+        state = self._default.clone()
+        context = self._draw_start(state)
+        state, context = self.task.start(self.view, state, context, self.generator, self.training)
+        self.physics.reset(mask, state)
+        zero = torch.zeros((), dtype=torch.long, device=self.device)
+        self.view.clock = torch.where(mask, zero, self.view.clock)
+        self.age = torch.where(mask, zero, self.age)
+        self.view.heading = Heading(self.physics.body_quat[:, :, 0])
+        fresh = self.task.begin(self.view, context)
+        if not self.memory:
+            self.memory = fresh
+        self.memory = {
+            k: torch.where(mask.view(-1, *[1] * (v.dim() - 1)), v, self.memory[k])
+            for k, v in fresh.items()
+        }
+
+    def _draw_start(self, state: PhysicsState) -> Memory:
+        """Joint noise, or a frame of a demonstration; labels are NaN for a standing start."""
+        scene, n = self.physics.scene, self.num_worlds
+        if self.training:
+            for agent in range(self.num_agents):
+                joints = state.qpos[:, scene.agent_qpos(agent)][:, 7:]
+                draw = torch.rand(joints.shape, device=self.device, generator=self.generator)
+                joints += START_NOISE * (2.0 * draw - 1.0)
+        if self.starts is None:
+            return {}
+        frames = self.starts.qpos.shape[0]
+        draw = torch.rand(n, 2, device=self.device, generator=self.generator)
+        use = draw[:, 0] < self.starts.probability
+        frame = (draw[:, 1] * frames).long().clamp(max=frames - 1)
+        q, v = scene.agent_qpos(0), scene.agent_qvel(0)
+        state.qpos[:, q] = torch.where(use[:, None], self.starts.qpos[frame], state.qpos[:, q])
+        state.qvel[:, v] = torch.where(use[:, None], self.starts.qvel[frame], state.qvel[:, v])
+        nan = torch.full((), torch.nan, device=self.device)
+        return {k: torch.where(use, c[frame], nan) for k, c in self.starts.context.items()}
+
+    def _observe(self) -> Tensor:
+        goal = self.task.features(self.view, self.memory)
+        if not self.obs_slices:
+            slices = proprioception_slices(self.physics.scene.body.num_links)
+            at = slices["body_angvel"].stop
+            for name, value in goal.items():
+                slices[f"goal/{name}"] = slice(at, at + value.shape[-1])
+                at += value.shape[-1]
+            self.obs_slices = slices
+        obs = torch.cat((proprioception(self.physics, self.view.heading), *goal.values()), dim=-1)
+        return torch.nan_to_num(obs)
+
+    def snapshot(self) -> dict[str, Tensor]:
+        """Copies of qpos, qvel, mocap_pos and ground_force, for recordings."""
+        physics = self.physics
+        return {
+            "qpos": physics.qpos.clone(),
+            "qvel": physics.qvel.clone(),
+            "mocap_pos": physics.mocap_pos.clone(),
+            "ground_force": physics.ground_force.clone(),
+        }
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that decides the future: physics, clocks, memory, curriculum, generator."""
+        state = {
+            "qpos": self.physics.qpos.clone(),
+            "qvel": self.physics.qvel.clone(),
+            "mocap_pos": self.physics.mocap_pos.clone(),
+            "clock": self.view.clock.clone(),
+            "age": self.age.clone(),
+            "generator": self.generator.get_state(),
+        }
+        extra = getattr(self.physics, "extra_state", None)
+        if extra is not None:
+            state |= {f"physics/{k}": v for k, v in extra().items()}
+        state |= {f"memory/{k}": v.clone() for k, v in self.memory.items()}
+        state |= {f"curriculum/{k}": v.clone() for k, v in self.curriculum.items()}
+        return state
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> Tensor:
+        """Continues where :meth:`state_dict` was taken; returns the observation (N, A, obs).
+
+        Raises ValueError for the state of another task or world count.
+        """
+        if "qpos" not in state or state["qpos"].shape != self.physics.qpos.shape:
+            raise ValueError("the environment state is of another task or number of worlds")
+        moved = {k: v if k == "generator" else v.to(self.device) for k, v in state.items()}
+        everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
+        physics_state = PhysicsState(moved["qpos"], moved["qvel"], moved["mocap_pos"])
+        self.physics.reset(everyone, physics_state)
+        load_extra = getattr(self.physics, "load_extra_state", None)
+        if load_extra is not None:
+            prefix = "physics/"
+            load_extra({k[len(prefix) :]: v for k, v in moved.items() if k.startswith(prefix)})
+        self.view.clock, self.age = moved["clock"], moved["age"]
+        self.generator.set_state(moved["generator"].cpu())
+        self.memory = {k[7:]: v for k, v in moved.items() if k.startswith("memory/")}
+        self.view.curriculum = {k[11:]: v for k, v in moved.items() if k.startswith("curriculum/")}
+        self.view.heading = Heading(self.physics.body_quat[:, :, 0])
+        return self._observe()
+
+    def close(self) -> None:
+        """Frees the engine."""
+        self.physics.close()
+
+
+def make_scene(
+    task: str,
+    *,
+    strength: Strength = "paper",
+    limits: Limits = "paper",
+    options: dict[str, Any] | None = None,
+    timestep_divisor: int = 1,
+) -> Scene:
+    """The scene of a task at a strength. ``timestep_divisor`` 2 halves the time step at the same
+    control rate. Raises ValueError for an unknown task, option, strength or limits."""
+    if timestep_divisor < 1:
+        raise ValueError(f"timestep_divisor must be at least 1, not {timestep_divisor}")
+    record = get_task(task)
+    body = load_body(record.body, strength=strength, limits=limits, equipment=record.equipment)
+    scene = record.scene(make_config(record, options), body)
+    return dataclasses.replace(
+        scene,
+        timestep=scene.timestep / timestep_divisor,
+        substeps=scene.substeps * timestep_divisor,
+    )
+
+
+def make_env(
+    task: str,
+    *,
+    engine: str = "mujoco",
+    num_worlds: int = 256,
+    seed: int = 0,
+    strength: Strength = "paper",
+    limits: Limits = "paper",
+    training: bool = True,
+    options: dict[str, Any] | None = None,
+    physics_options: dict[str, Any] | None = None,
+    starts: Starts | None = None,
+    timestep_divisor: int = 1,
+) -> Env:
+    """An environment of ``num_worlds`` worlds of a task on an engine.
+
+    ``options`` are the fields of the task's config, ``physics_options`` those of the engine.
+    Raises ValueError for an unknown task, option, strength or engine, RuntimeError when the
+    engine cannot run here.
+    """
+    record = get_task(task)
+    config = make_config(record, options)
+    scene = make_scene(
+        task,
+        strength=strength,
+        limits=limits,
+        options=options,
+        timestep_divisor=timestep_divisor,
+    )
+    physics = make_physics(engine, scene, num_worlds, **(physics_options or {}))
+    return Env(record, config, physics, seed=seed, training=training, starts=starts)

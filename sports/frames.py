@@ -1,0 +1,67 @@
+"""The one heading frame: origin at the root, z up, x along the athlete's yaw.
+
+Proprioception and goal features both use it, so a policy sees the same world whatever its
+place and direction on the field.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sports import quaternion
+from sports.physics.base import Physics
+
+
+class Heading:
+    """Rotates world vectors into the heading frames of the athletes."""
+
+    def __init__(self, root_quat: Tensor) -> None:
+        """``root_quat`` (N, A, 4)."""
+        angle = quaternion.yaw(root_quat)
+        self.cos, self.sin = torch.cos(angle), torch.sin(angle)
+
+    def local(self, v: Tensor) -> Tensor:
+        """(N, A, ..., 3) world vectors seen from the heading frame."""
+        shape = self.cos.shape + (1,) * (v.dim() - self.cos.dim() - 1)
+        c, s = self.cos.view(shape), self.sin.view(shape)
+        x, y, z = v.unbind(-1)
+        return torch.stack((c * x + s * y, c * y - s * x, z), dim=-1)
+
+
+def proprioception_slices(num_links: int) -> dict[str, slice]:
+    """Named layout of :func:`proprioception` for a body with ``num_links`` links."""
+    sizes = {
+        "root_height": 1,
+        "body_pos": 3 * (num_links - 1),
+        "body_rot": 6 * num_links,
+        "body_linvel": 3 * num_links,
+        "body_angvel": 3 * num_links,
+    }
+    slices, at = {}, 0
+    for name, size in sizes.items():
+        slices[name] = slice(at, at + size)
+        at += size
+    return slices
+
+
+def proprioception(physics: Physics, heading: Heading) -> Tensor:
+    """(N, A, 15 B - 2) what an athlete feels of its own body: SMPL 358, SMPL-X 778.
+
+    Order: root height; link positions relative to the root; link rotations in 6-D (first two
+    columns of the rotation matrix, Zhou et al. 2019); linear and angular velocities; all but
+    the height in the heading frame.
+    """
+    n, a, b = physics.body_pos.shape[:3]
+    root = physics.body_pos[:, :, :1]
+    columns = quaternion.matrix(physics.body_quat)[..., :2].transpose(-1, -2)  # (N, A, B, 2, 3)
+    vectors = torch.cat(
+        (
+            physics.body_pos[:, :, 1:] - root,
+            columns.reshape(n, a, 2 * b, 3),
+            physics.body_linvel,
+            physics.body_angvel,
+        ),
+        dim=2,
+    )
+    return torch.cat((root[:, :, 0, 2:], heading.local(vectors).flatten(2)), dim=-1)

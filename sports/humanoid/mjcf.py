@@ -1,0 +1,187 @@
+"""Writes a scene as a MuJoCo model through MjSpec.
+
+Gains act as ``stiffness = position servo limited to +-effort``, ``damping = passive joint
+damping``: a clamped damper inside the actuator stops damping and explodes (measured). Contact
+forces come from contact sensors (``netforce``): one per athlete link against the ground, then
+one per named pair of the scene, three numbers each, world frame.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from sports.humanoid.body import Body, Shape
+from sports.scene import Scene, SceneObject, humanoid_scene
+
+GROUND = "ground"
+_KIND = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+}
+_FORCE_DATA = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+_NETFORCE = 3
+# Collision classes: bit 0 everything solid, bit 1 the ground plane.
+_SOLID, _GROUND = 1, 2
+
+
+def body_name(agent: int, link: str) -> str:
+    """Name of a link's body in the MuJoCo model."""
+    return f"agent{agent}/{link}"
+
+
+def _add_shape(body: mujoco.MjsBody, shape: Shape, **fields: object) -> None:
+    geom = body.add_geom(type=_KIND[shape.kind], mass=shape.mass, **fields)
+    if shape.end is None:
+        geom.pos = shape.center
+        geom.size[: len(shape.size)] = shape.size
+    else:
+        geom.fromto = (*shape.center, *shape.end)
+        geom.size[0] = shape.size[0]
+
+
+def _add_agent(spec: mujoco.MjSpec, scene: Scene, agent: int) -> None:
+    body, friction = scene.body, scene.ground_friction
+    bodies: dict[str, mujoco.MjsBody] = {}
+    for link in body.links:
+        parent = spec.worldbody if link.parent is None else bodies[link.parent]
+        node = parent.add_body(name=body_name(agent, link.name), pos=link.offset)
+        if link.parent is None:
+            node.pos, node.quat = np.split(scene.default_qpos()[scene.agent_qpos(agent)][:7], [3])
+        bodies[link.name] = node
+        if link.parent is None:
+            node.add_freejoint(name=f"agent{agent}/root")
+        for shape in link.shapes:
+            _add_shape(
+                node,
+                shape,
+                friction=(friction, 0.005, 0.0001),
+                contype=_SOLID,
+                conaffinity=_SOLID | _GROUND,
+                condim=3,
+                rgba=(0.72, 0.55, 0.43, 1.0) if agent % 2 == 0 else (0.35, 0.5, 0.75, 1.0),
+            )
+    for dof in body.dofs:
+        joint = bodies[dof.link].add_joint(
+            name=f"agent{agent}/{dof.name}",
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=[float(dof.axis == a) for a in "xyz"],
+            range=(dof.lower, dof.upper),
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            armature=dof.armature,
+        )
+        joint.damping[0] = dof.kd
+        actuator = spec.add_actuator(
+            name=f"agent{agent}/{dof.name}",
+            target=joint.name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            forcerange=(-dof.effort, dof.effort),
+        )
+        actuator.gainprm[0] = dof.kp
+        actuator.biasprm[:3] = (0.0, -dof.kp, 0.0)
+    for a, b in body.excluded_pairs:
+        spec.add_exclude(bodyname1=body_name(agent, a), bodyname2=body_name(agent, b))
+
+
+def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
+    node = spec.worldbody.add_body(
+        name=obj.name, pos=obj.pos, quat=obj.quat, mocap=obj.motion == "mocap"
+    )
+    if obj.motion == "free":
+        node.add_freejoint(name=obj.name)
+    for shape in obj.shapes:
+        fields: dict[str, object] = dict(
+            friction=(obj.friction, 0.005, 0.0001),
+            contype=_SOLID,
+            conaffinity=_SOLID | (_GROUND if obj.meets_ground else 0),
+            condim=3,
+            rgba=obj.rgba,
+        )
+        if obj.solref is not None:
+            fields["solref"] = obj.solref
+        _add_shape(node, shape, **fields)
+
+
+def _side(scene: Scene, name: str) -> tuple[mujoco.mjtObj, str]:
+    if "/" in name:
+        return mujoco.mjtObj.mjOBJ_BODY, name
+    if name.startswith("agent"):
+        return mujoco.mjtObj.mjOBJ_XBODY, f"{name}/{scene.body.links[0].name}"
+    return mujoco.mjtObj.mjOBJ_BODY, name
+
+
+def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
+    def add(name: str, a: tuple[mujoco.mjtObj, str], b: tuple[mujoco.mjtObj, str]) -> None:
+        # MuJoCo reports the force on the second object: our first side, world frame.
+        sensor = spec.add_sensor(
+            name=name,
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=b[0],
+            objname=b[1],
+            reftype=a[0],
+            refname=a[1],
+        )
+        sensor.intprm[:3] = (_FORCE_DATA, _NETFORCE, 1)
+
+    ground = (mujoco.mjtObj.mjOBJ_GEOM, GROUND)
+    for agent in range(scene.num_agents):
+        for link in scene.body.links:
+            name = body_name(agent, link.name)
+            add(f"ground:{name}", (mujoco.mjtObj.mjOBJ_BODY, name), ground)
+    for a, b in scene.contact_pairs:
+        add(f"pair:{a}:{b}", _side(scene, a), _side(scene, b))
+
+
+def build_spec(scene: Scene) -> mujoco.MjSpec:
+    """The scene as an MjSpec: ground, athletes, objects, actuators, sensors, exclusions."""
+    spec = mujoco.MjSpec()
+    spec.modelname = scene.name
+    spec.compiler.degree = False
+    spec.option.timestep = scene.timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    # A diverged world is found, reset and counted by the backend, never silently by the engine.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1920, 1080
+    ground = spec.worldbody.add_geom(
+        name=GROUND,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=(0, 0, 1),
+        friction=(scene.ground_friction, 0.005, 0.0001),
+        contype=_GROUND,
+        conaffinity=_GROUND,
+        condim=3,
+        rgba=(0.6, 0.62, 0.65, 1.0),
+    )
+    assert ground is not None
+    for i in range(scene.num_agents):
+        _add_agent(spec, scene, i)
+    for obj in scene.objects:
+        _add_object(spec, obj)
+    _add_contact_sensors(spec, scene)
+    return spec
+
+
+def build_model(scene: Scene | Body) -> mujoco.MjModel:
+    """Compiles a scene, or one athlete alone on the ground, with ``qpos0`` at its start."""
+    if isinstance(scene, Body):
+        scene = humanoid_scene(scene)
+    model = build_spec(scene).compile()
+    if (model.nq, model.nv, model.nu) != (scene.nq, scene.nv, scene.nu):
+        raise RuntimeError(f"scene '{scene.name}': compiled model has an unexpected layout")
+    return model
+
+
+def dof_order(model: mujoco.MjModel) -> list[str]:
+    """Names of the hinge joints in ``qpos`` order, agent prefix dropped, for parity tables."""
+    return [
+        model.joint(i).name.split("/", 1)[1]
+        for i in range(model.njnt)
+        if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE
+    ]

@@ -1,0 +1,201 @@
+"""Long jump: a 20 m run-up, one flight from behind the line, measured to the nearest mark.
+
+A jump is one flight: RUN until no link touches the ground with the root beyond the line, FLIGHT
+until the first ground contact of any link, LANDED for 9 more steps; the length is the smallest x
+of any ground contact point in those steps, minus 20. A link on the ground on or beyond the line
+before the flight is a foul. Source: SMPLOlympics section 4 for goal and reward; World Athletics
+technical rules for the foul and for measuring to the nearest mark left by any part of the body.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sports.humanoid.body import Body
+from sports.physics.base import PhysicsState
+from sports.scene import Scene
+from sports.task import Advance, Memory, Task, View, clamp01, nan_where, progress
+
+LINE_X = 20.0
+START, LINE, GOAL = (0.0, 0.0, 0.0), (LINE_X, 0.0, 0.0), (30.0, 0.0, 1.0)
+RUNWAY_HALF_WIDTH, PIT_HALF_WIDTH = 0.5, 1.5
+RUN, FLIGHT, LANDED = 0, 1, 2
+MARK_STEPS = 9
+"""Steps after the landing step in which marks count."""
+TOUCH = 1e-3
+"""A support point this close to the ground (m) leaves a mark."""
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class LongJump:
+    """Options of the long jump."""
+
+
+def scene(config: LongJump, body: Body) -> Scene:
+    """Runway and pit on one plane."""
+    return Scene(
+        name="long_jump",
+        body=body,
+        sites={"start": START, "line": LINE, "goal": GOAL},
+    )
+
+
+def start(
+    view: View,
+    state: PhysicsState,
+    context: Memory,
+    generator: torch.Generator,
+    training: bool,
+) -> tuple[PhysicsState, Memory]:
+    """Nothing to draw."""
+    return state, {}
+
+
+def begin(view: View, context: Memory) -> Memory:
+    """Memory after a reset: running, no mark yet."""
+    root = view.root_pos[:, 0]
+    zero = torch.zeros_like(root[:, 0])
+    return {
+        "root": root.clone(),
+        "rear": _rear(view),
+        "mode": zero.long(),
+        "since_landing": zero.clone(),
+        "mark": torch.full_like(zero, torch.inf),
+        "flight_steps": zero.clone(),
+        "takeoff_speed": torch.full_like(zero, torch.nan),
+        "takeoff_com_z": torch.full_like(zero, torch.nan),
+        "landing_com_z": torch.full_like(zero, torch.nan),
+    }
+
+
+def features(view: View, memory: Memory) -> dict[str, Tensor]:
+    """Start, line and goal as seen from the athlete (9)."""
+    root = view.root_pos
+    return {
+        name: view.heading.local(torch.tensor(point, device=root.device) - root)
+        for name, point in (("start", START), ("line", LINE), ("goal", GOAL))
+    }
+
+
+def advance(view: View, memory: Memory) -> Advance:
+    """One control step by the rules of the sport."""
+    root = view.root_pos[:, 0]
+    x, y = root[:, 0], root[:, 1]
+    goal = torch.tensor(GOAL, device=root.device)
+    touched = view.touching()[:, 0]  # (N, B) in any substep
+    geometry = view.geometry
+    points = geometry.world_points(view.physics.body_pos[:, 0], view.physics.body_quat[:, 0])
+    on_ground = points[..., 2] - geometry.radii < TOUCH  # (N, K) now
+    link_on_ground = torch.zeros_like(touched, dtype=torch.long).index_add(
+        1, geometry.owner, on_ground.long()
+    )
+    rear = _rear(view)
+    # A link that touched within the step and is off again: all of it was at or beyond this x.
+    brief = touched & (link_on_ground == 0)
+    brief_x = torch.where(brief, torch.minimum(rear, memory["rear"]), torch.inf)
+    any_contact = touched.any(-1) | on_ground.any(-1)
+
+    mode = memory["mode"]
+    running = mode == RUN
+    front = torch.where(on_ground, points[..., 0], -torch.inf).amax(-1)
+    brief_front = torch.where(brief, brief_x, -torch.inf).amax(-1)
+    foul = running & ((front >= LINE_X) | (brief_front >= LINE_X))
+    fell = running & view.fallen()[:, 0]
+    half_width = torch.where(x <= LINE_X, RUNWAY_HALF_WIDTH, PIT_HALF_WIDTH)
+    off_track = y.abs() > half_width
+
+    takes_off = running & ~any_contact & (x > LINE_X)
+    lands = (mode == FLIGHT) & any_contact
+    mode = torch.where(takes_off, FLIGHT, torch.where(lands, LANDED, mode))
+    landed = mode == LANDED
+    nearest = torch.minimum(
+        torch.where(on_ground, points[..., 0], torch.inf).amin(-1), brief_x.amin(-1)
+    )
+    mark = torch.where(landed, torch.minimum(memory["mark"], nearest), memory["mark"])
+    since_landing = memory["since_landing"] + (landed & ~lands)
+    measured = landed & (since_landing >= MARK_STEPS)
+    failed = foul | fell | off_track
+    success = measured & ~failed
+    length = mark - LINE_X
+
+    flying = mode == FLIGHT
+    terms = {
+        "progress": clamp01(progress(memory["root"], root, goal)),
+        "speed": 0.01 * view.root_linvel[:, 0, 0],
+        "flight": 0.1 * root[:, 2] * flying,
+        "length": torch.where(success, 30.0 * length, 0.0),
+    }
+
+    com, com_velocity = geometry.center_of_mass(view.physics, agent=0)
+    takeoff_speed = torch.where(takes_off, com_velocity.norm(dim=-1), memory["takeoff_speed"])
+    takeoff_com_z = torch.where(takes_off, com[:, 2], memory["takeoff_com_z"])
+    landing_com_z = torch.where(lands, com[:, 2], memory["landing_com_z"])
+    flight_steps = memory["flight_steps"] + flying
+    legal = ~success
+    metrics = {
+        "success": success.float(),
+        "length": nan_where(legal, length),
+        "flight_time": nan_where(legal, flight_steps * view.control_timestep),
+        "takeoff_speed": nan_where(legal, takeoff_speed),
+        "length_bound": nan_where(legal, length_bound(takeoff_speed, takeoff_com_z, landing_com_z)),
+        "foul": foul.float(),
+    }
+    memory = {
+        "root": root.clone(),
+        "rear": rear,
+        "mode": mode,
+        "since_landing": since_landing,
+        "mark": mark,
+        "flight_steps": flight_steps,
+        "takeoff_speed": takeoff_speed,
+        "takeoff_com_z": takeoff_com_z,
+        "landing_com_z": landing_com_z,
+    }
+    return Advance(
+        memory=memory,
+        terms={name: term[:, None] for name, term in terms.items()},
+        terminated=failed | success,
+        metrics=metrics,
+        success=success,
+    )
+
+
+def length_bound(speed: Tensor, takeoff_z: Tensor, landing_z: Tensor) -> Tensor:
+    """(N,) length (m) that no jump from this take-off can pass: the best ballistic range of the
+    centre of mass, (v / g) sqrt(v^2 + 2 g dz), plus 1.2 m of body."""
+    drop = (speed.square() + 2 * GRAVITY * (takeoff_z - landing_z)).clamp(min=0.0)
+    return speed / GRAVITY * drop.sqrt() + 1.2
+
+
+def _rear(view: View) -> Tensor:
+    """(N, B) smallest x of each link."""
+    back = torch.tensor((-1.0, 0.0, 0.0), device=view.clock.device)
+    physics = view.physics
+    return -view.geometry.extent(physics.body_pos[:, 0], physics.body_quat[:, 0], back)
+
+
+TASK = Task(
+    name="long_jump",
+    config=LongJump,
+    scene=scene,
+    start=start,
+    begin=begin,
+    features=features,
+    advance=advance,
+    metrics={
+        "success": "fraction",
+        "length": "m",
+        "flight_time": "s",
+        "takeoff_speed": "m/s",
+        "length_bound": "m",
+        "foul": "fraction",
+    },
+    main_metric="length",
+    max_steps=600,
+    reward_scale=10.0,
+    summary="Run up 20 m and jump from behind the line.",
+)

@@ -1,0 +1,194 @@
+"""What every engine offers: one protocol of batched torch tensors. Task code sees nothing else.
+
+Shapes: N worlds, A agents, B links, P contact pairs, O free objects, M mocap objects.
+World frame, z up; quaternions (w, x, y, z); m, kg, s, rad, N. Tensors are float32 on
+``device``. They are valid after ``step`` and ``reset`` and overwritten in place by the next
+call: keep a clone of what must outlive it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sports import quaternion
+from sports.humanoid.body import Body, Shape, support_points
+from sports.scene import Scene
+
+
+@dataclass
+class PhysicsState:
+    """Everything that decides a world's future, for resets and warm starts."""
+
+    qpos: Tensor
+    """(N, nq)"""
+    qvel: Tensor
+    """(N, nv); a root's angular velocity in its own frame, as in MuJoCo."""
+    mocap_pos: Tensor
+    """(N, M, 3) positions of the movable fixtures."""
+
+    def clone(self) -> PhysicsState:
+        return PhysicsState(self.qpos.clone(), self.qvel.clone(), self.mocap_pos.clone())
+
+
+class Physics(Protocol):
+    """A batch of worlds of one scene on one engine."""
+
+    engine: str
+    """``mujoco``, ``warp`` or ``drake``."""
+    scene: Scene
+    num_worlds: int
+    device: torch.device
+
+    qpos: Tensor
+    """(N, nq)"""
+    qvel: Tensor
+    """(N, nv)"""
+    mocap_pos: Tensor
+    """(N, M, 3)"""
+    body_pos: Tensor
+    """(N, A, B, 3) link origins p_WB."""
+    body_quat: Tensor
+    """(N, A, B, 4) link rotations R_WB."""
+    body_linvel: Tensor
+    """(N, A, B, 3) velocity of the link origins, world frame."""
+    body_angvel: Tensor
+    """(N, A, B, 3) angular velocity w_WB, world frame."""
+    ground_force: Tensor
+    """(N, A, B, 3) force of the ground on each link, world frame, in that substep of the last
+    control step in which it was largest; zero where the link never touched."""
+    pair_force: Tensor
+    """(N, P) largest net contact force over the substeps between the scene's named pairs."""
+    object_pos: Tensor
+    """(N, O, 3) origins of the free objects."""
+    object_quat: Tensor
+    """(N, O, 4)"""
+    object_linvel: Tensor
+    """(N, O, 3) world frame."""
+    object_angvel: Tensor
+    """(N, O, 3) world frame."""
+    bad: Tensor
+    """(N,) bool: the last step left NaN or absurd numbers, or overflowed a buffer, in this
+    world. The caller must reset it; its tensors are finite but meaningless."""
+    nan_worlds: int | Tensor
+    """Worlds found bad for numbers so far (a device tensor where reading it would wait)."""
+    overflow: int | Tensor
+    """Worlds whose constraint or contact buffers overflowed so far."""
+
+    def step(self, ctrl: Tensor) -> None:
+        """Advances one control step with PD targets ``ctrl`` (N, nu), rad, held constant."""
+        ...
+
+    def reset(self, mask: Tensor, state: PhysicsState) -> None:
+        """Puts the worlds where ``mask`` (N,) is true into their rows of ``state``.
+
+        Kinematic tensors are current afterwards in every world; contact forces are zero in the
+        reset ones.
+        """
+        ...
+
+    def extent(self, direction: Tensor) -> Tensor:
+        """(N, A, B) furthest reach of each link's shapes along unit ``direction`` (3,), m."""
+        ...
+
+    def close(self) -> None:
+        """Frees threads and device memory."""
+        ...
+
+
+def default_state(scene: Scene, num_worlds: int, device: torch.device | str) -> PhysicsState:
+    """The scene's start pose at rest, repeated over the worlds."""
+
+    def rows(values: np.ndarray) -> Tensor:
+        row = torch.as_tensor(values, dtype=torch.float32, device=device)
+        return row.expand(num_worlds, *row.shape).clone()
+
+    return PhysicsState(
+        qpos=rows(scene.default_qpos()),
+        qvel=torch.zeros(num_worlds, scene.nv, device=device),
+        mocap_pos=rows(scene.default_mocap_pos()),
+    )
+
+
+def _middle(shape: Shape) -> np.ndarray:
+    center = np.asarray(shape.center, dtype=float)
+    return center if shape.end is None else (center + np.asarray(shape.end)) / 2
+
+
+class Geometry:
+    """Support points of the body's links: where a link ends in a direction, where it touches.
+
+    The same table on every engine, so that lengths and clearances do not depend on one.
+    """
+
+    def __init__(self, body: Body, device: torch.device | str) -> None:
+        points, radii, owner = [], [], []
+        for i, link in enumerate(body.links):
+            for shape in link.shapes:
+                for point, radius in support_points(shape):
+                    points.append(point)
+                    radii.append(radius)
+                    owner.append(i)
+        self.num_links = body.num_links
+        self.points = torch.tensor(np.array(points), dtype=torch.float32, device=device)
+        """(K, 3) in the owner link's frame."""
+        self.radii = torch.tensor(radii, dtype=torch.float32, device=device)
+        self.owner = torch.tensor(owner, device=device)
+        """(K,) link index."""
+        # Padded per link, so that a reduction over a link's points is one gather and one max.
+        counts = np.bincount(owner, minlength=body.num_links)
+        starts = np.concatenate(([0], np.cumsum(counts)[:-1]))
+        padded = starts[:, None] + np.minimum(np.arange(counts.max()), counts[:, None] - 1)
+        self.padded = torch.tensor(padded, device=device)
+        mass = np.array([sum(s.mass for s in link.shapes) for link in body.links])
+        moment = np.array([sum(s.mass * _middle(s) for s in link.shapes) for link in body.links])
+        self.mass = torch.tensor(mass, dtype=torch.float32, device=device)
+        """(B,) kg"""
+        center = moment / mass[:, None]
+        self.center = torch.tensor(center, dtype=torch.float32, device=device)
+        """(B, 3) centre of mass of each link in its own frame (m)."""
+
+    @cached_property
+    def _padded_points(self) -> Tensor:
+        return self.points[self.padded]  # (B, K', 3)
+
+    @cached_property
+    def _padded_radii(self) -> Tensor:
+        return self.radii[self.padded]
+
+    def world_points(self, body_pos: Tensor, body_quat: Tensor) -> Tensor:
+        """(..., K, 3) support points in the world; the balls around them have ``radii``."""
+        pos, quat = body_pos[..., self.owner, :], body_quat[..., self.owner, :]
+        return pos + quaternion.rotate(quat, self.points)
+
+    def center_of_mass(self, physics: Physics, agent: int) -> tuple[Tensor, Tensor]:
+        """(N, 3) centre of mass of an athlete (m) and (N, 3) its velocity (m/s), world frame."""
+        arm = quaternion.rotate(physics.body_quat[:, agent], self.center)  # (N, B, 3)
+        share = (self.mass / self.mass.sum())[:, None]
+        spin = torch.linalg.cross(physics.body_angvel[:, agent], arm)
+        position = ((physics.body_pos[:, agent] + arm) * share).sum(1)
+        return position, ((physics.body_linvel[:, agent] + spin) * share).sum(1)
+
+    def extent(self, body_pos: Tensor, body_quat: Tensor, direction: Tensor) -> Tensor:
+        """(..., B) furthest reach along unit ``direction`` (3,) of each link, m."""
+        local = quaternion.rotate(quaternion.conjugate(body_quat), direction)  # (..., B, 3)
+        reach = torch.einsum("...bi,bki->...bk", local, self._padded_points) + self._padded_radii
+        return (body_pos * direction).sum(-1) + reach.amax(-1)
+
+
+SPEED_LIMIT = 200.0
+"""A generalised velocity above this (m/s or rad/s) means that a world has diverged."""
+
+
+def diverged(qpos: Tensor, qvel: Tensor) -> Tensor:
+    """(N,) worlds whose numbers are not finite or beyond any athlete."""
+    return ~(
+        torch.isfinite(qpos).all(-1)
+        & torch.isfinite(qvel).all(-1)
+        & (qvel.abs().amax(-1) < SPEED_LIMIT)
+    )

@@ -1,0 +1,151 @@
+"""C MuJoCo on a native thread pool: the engine that runs everywhere.
+
+Each control step is ``substeps`` calls of the batch; contact forces are kept from the substep
+in which they were largest, and the last call leaves positions and velocities current.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from torch import Tensor
+
+from sports.humanoid.mjcf import body_name, build_model
+from sports.physics.base import Geometry, PhysicsState, default_state, diverged
+from sports.scene import Scene
+
+_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
+
+
+class MujocoPhysics:
+    """The ``mujoco`` engine; see :class:`sports.physics.base.Physics` for the tensors."""
+
+    engine = "mujoco"
+
+    def __init__(self, scene: Scene, num_worlds: int, threads: int = 0) -> None:
+        self.scene = scene
+        self.num_worlds = n = num_worlds
+        self.device = torch.device("cpu")
+        self.model = model = build_model(scene)
+        self.batch = Batch(model, nsim=n, nthread=threads)
+        self.geometry = Geometry(scene.body, self.device)
+        bind = self.batch.bind
+        self._qpos, self._qvel, self._ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
+        self._mocap = bind("mocap_pos") if model.nmocap else None
+        self._xpos, self._xquat, self._cvel = bind("xpos"), bind("xquat"), bind("cvel")
+        self._com, self._sensors = bind("subtree_com"), bind("sensordata")
+        self._warmstart = bind("qacc_warmstart")
+
+        agents, links = scene.num_agents, scene.body.num_links
+        self._ids = np.array(
+            [
+                [model.body(body_name(a, link)).id for link in scene.body.link_names]
+                for a in range(agents)
+            ]
+        )
+        self._objects = np.array([model.body(o.name).id for o in scene.free_objects], dtype=int)
+        every = np.concatenate((self._ids.ravel(), self._objects))
+        self._rows, self._roots = every, model.body_rootid[every]
+        self._mocap_rows = [model.body(o.name).mocapid[0] for o in scene.mocap_objects]
+        self._shape = (agents, links)
+        self._num_ground = agents * links
+
+        self.qpos = torch.zeros(n, scene.nq)
+        self.qvel = torch.zeros(n, scene.nv)
+        self.mocap_pos = torch.zeros(n, len(self._mocap_rows), 3)
+        self.ground_force = torch.zeros(n, agents, links, 3)
+        self.pair_force = torch.zeros(n, len(scene.contact_pairs))
+        self.bad = torch.zeros(n, dtype=torch.bool)
+        self.nan_worlds = 0
+        self.overflow = 0
+        self._forces = np.zeros((n, model.nsensordata // 3, 3))
+        self.batch.reset(stage=_VEL)
+        self._read()
+
+    def step(self, ctrl: Tensor) -> None:
+        self._ctrl[:] = ctrl.numpy()
+        forces, largest = None, None
+        for i in range(self.scene.substeps):
+            last = i == self.scene.substeps - 1
+            self.batch.step(stage=_VEL if last else 0)
+            now = self._sensors.reshape(self.num_worlds, -1, 3)
+            norm = np.einsum("nsi,nsi->ns", now, now)
+            if forces is None:
+                forces, largest = now.copy(), norm
+            else:
+                more = norm > largest
+                np.copyto(forces, now, where=more[:, :, None])
+                np.copyto(largest, norm, where=more)
+        self._forces = np.nan_to_num(forces)
+        self._read()
+        self.bad = diverged(self.qpos, self.qvel)
+        if self.bad.any():
+            self.nan_worlds += int(self.bad.sum())
+            safe = default_state(self.scene, self.num_worlds, self.device)
+            safe.mocap_pos = self.mocap_pos
+            self.reset(self.bad, safe)
+
+    def reset(self, mask: Tensor, state: PhysicsState) -> None:
+        ids = np.flatnonzero(mask.numpy())
+        if ids.size == 0:
+            return
+        self.batch.reset(ids=ids, stage=0)
+        self._qpos[ids] = state.qpos.numpy()[ids]
+        self._qvel[ids] = state.qvel.numpy()[ids]
+        if self._mocap is not None:
+            mocap = state.mocap_pos.numpy()[ids]
+            for k, row in enumerate(self._mocap_rows):
+                self._mocap[ids, row] = mocap[:, k]
+        self.batch.forward(ids=ids, stage=_VEL)
+        self._forces[ids] = 0.0
+        self._read()
+
+    def extent(self, direction: Tensor) -> Tensor:
+        return self.geometry.extent(self.body_pos, self.body_quat, direction)
+
+    def extra_state(self) -> dict[str, Tensor]:
+        """Double-precision state and the solver's warm start: with them a resumed run repeats
+        the interrupted one bit for bit."""
+        return {
+            "qpos": torch.from_numpy(self._qpos.copy()),
+            "qvel": torch.from_numpy(self._qvel.copy()),
+            "qacc_warmstart": torch.from_numpy(self._warmstart.copy()),
+        }
+
+    def load_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Restores :meth:`extra_state`; call after ``reset``."""
+        self._qpos[:], self._qvel[:] = state["qpos"].numpy(), state["qvel"].numpy()
+        self._warmstart[:] = state["qacc_warmstart"].numpy()
+        self.batch.forward(stage=_VEL)
+        self._read()
+
+    def close(self) -> None:
+        del self.batch
+
+    def _read(self) -> None:
+        """Copies the engine's float64 rows into the float32 tensors of the protocol."""
+        n, (agents, links) = self.num_worlds, self._shape
+        self.qpos = torch.from_numpy(self._qpos.astype(np.float32))
+        self.qvel = torch.from_numpy(self._qvel.astype(np.float32))
+        if self._mocap is not None:
+            self.mocap_pos = torch.from_numpy(self._mocap[:, self._mocap_rows].astype(np.float32))
+        position = self._xpos[:, self._rows]
+        spin = self._cvel[:, self._rows, :3]
+        # cvel is taken at the centre of mass of the kinematic tree; move it to the link origin.
+        velocity = self._cvel[:, self._rows, 3:] + np.cross(
+            spin, position - self._com[:, self._roots]
+        )
+        pos = torch.from_numpy(position.astype(np.float32))
+        quat = torch.from_numpy(self._xquat[:, self._rows].astype(np.float32))
+        lin = torch.from_numpy(velocity.astype(np.float32))
+        ang = torch.from_numpy(spin.astype(np.float32))
+        k = agents * links
+        self.body_pos, self.object_pos = pos[:, :k].view(n, agents, links, 3), pos[:, k:]
+        self.body_quat, self.object_quat = quat[:, :k].view(n, agents, links, 4), quat[:, k:]
+        self.body_linvel, self.object_linvel = lin[:, :k].view(n, agents, links, 3), lin[:, k:]
+        self.body_angvel, self.object_angvel = ang[:, :k].view(n, agents, links, 3), ang[:, k:]
+        forces = torch.from_numpy(self._forces.astype(np.float32))
+        self.ground_force = forces[:, :k].reshape(n, agents, links, 3)
+        self.pair_force = forces[:, k:].norm(dim=-1)

@@ -1,0 +1,66 @@
+"""Batched unit quaternions (w, x, y, z) in torch. Every function broadcasts over leading axes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def multiply(a: Tensor, b: Tensor) -> Tensor:
+    """(..., 4) Hamilton product: the rotation ``b`` first, then ``a``."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        dim=-1,
+    )
+
+
+def conjugate(q: Tensor) -> Tensor:
+    """(..., 4) inverse of a unit quaternion."""
+    return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
+
+
+def rotate(q: Tensor, v: Tensor) -> Tensor:
+    """(..., 3) vector ``v`` rotated by ``q``."""
+    w, u = q[..., :1], q[..., 1:]
+    u, v = torch.broadcast_tensors(u, v)
+    t = 2.0 * torch.linalg.cross(u, v)
+    return v + w * t + torch.linalg.cross(u, t)
+
+
+def matrix(q: Tensor) -> Tensor:
+    """(..., 3, 3) rotation matrix of a unit quaternion."""
+    w, x, y, z = q.unbind(-1)
+    return torch.stack(
+        (
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - w * z),
+            2 * (x * z + w * y),
+            2 * (x * y + w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - w * x),
+            2 * (x * z - w * y),
+            2 * (y * z + w * x),
+            1 - 2 * (x * x + y * y),
+        ),
+        dim=-1,
+    ).unflatten(-1, (3, 3))
+
+
+def yaw(q: Tensor) -> Tensor:
+    """(...) heading: angle about +z of the body's x axis projected on the ground (rad)."""
+    w, x, y, z = q.unbind(-1)
+    return torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def from_yaw(angle: Tensor) -> Tensor:
+    """(..., 4) rotation by ``angle`` (rad) about +z."""
+    half = 0.5 * angle
+    zero = torch.zeros_like(half)
+    return torch.stack((torch.cos(half), zero, zero, torch.sin(half)), dim=-1)

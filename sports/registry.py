@@ -1,0 +1,34 @@
+"""The tasks by name. A new sport adds one line here (docs/new_sport.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from sports import high_jump, long_jump
+from sports.task import Task
+
+_TASKS: dict[str, Task] = {t.name: t for t in (high_jump.TASK, long_jump.TASK)}
+
+
+def task_names() -> tuple[str, ...]:
+    """Names of all tasks, in the order of the sports' page."""
+    return tuple(_TASKS)
+
+
+def get_task(name: str) -> Task:
+    """The task of that name. Raises ValueError that lists the known ones."""
+    if name not in _TASKS:
+        raise ValueError(f"unknown task '{name}'; known: {', '.join(_TASKS)}")
+    return _TASKS[name]
+
+
+def make_config(task: Task, options: dict[str, Any] | None = None) -> Any:
+    """The task's config with ``options`` set. Raises ValueError naming an unknown option."""
+    options = dict(options or {})
+    known = [f.name for f in dataclasses.fields(task.config)]
+    for key in options:
+        if key not in known:
+            have = ", ".join(known) or "none"
+            raise ValueError(f"task '{task.name}' has no option '{key}'; it has: {have}")
+    return task.config(**options)

@@ -1,0 +1,131 @@
+"""What a sport is to the rest of the project: a scene and four pure functions, in one record.
+
+A sport's module defines a frozen config dataclass, ``scene``, ``start``, ``features`` and
+``advance``, and registers them as a :class:`Task`. See docs/new_sport.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sports.frames import Heading
+from sports.humanoid.body import Body
+from sports.physics.base import Geometry, Physics, PhysicsState
+from sports.scene import Scene
+
+Memory = dict[str, Tensor]
+"""What a task remembers of each world between steps: (N, ...) tensors by name."""
+
+
+@dataclass
+class View:
+    """What a task function may look at: the engine's tensors, the frames, the clocks."""
+
+    physics: Physics
+    geometry: Geometry
+    config: Any
+    curriculum: Memory
+    clock: Tensor
+    """(N,) control steps since the reset; 1 after the first step."""
+    heading: Heading
+    control_timestep: float
+    foot_links: Tensor
+    """(B,) bool: ankles and toes, the links that may touch the ground."""
+    head_index: int
+
+    @property
+    def root_pos(self) -> Tensor:
+        """(N, A, 3)"""
+        return self.physics.body_pos[:, :, 0]
+
+    @property
+    def root_linvel(self) -> Tensor:
+        """(N, A, 3) world frame."""
+        return self.physics.body_linvel[:, :, 0]
+
+    def touching(self) -> Tensor:
+        """(N, A, B) links with a ground contact in any substep of the last control step."""
+        return self.physics.ground_force.square().sum(-1) > 0
+
+    def fallen(self) -> Tensor:
+        """(N, A) sports.md, Common: a link other than ankles and toes below 0.15 m (head 0.30 m)
+        or pressed on the ground with more than 50 N; from the second control step on."""
+        floor = torch.full_like(self.physics.body_pos[..., 2], 0.15)
+        floor[:, :, self.head_index] = 0.30
+        low = self.physics.body_pos[..., 2] < floor
+        pressed = self.physics.ground_force.square().sum(-1) > 50.0**2
+        down = ((low | pressed) & ~self.foot_links).any(-1)
+        return down & (self.clock >= 2)[:, None]
+
+
+@dataclass
+class Advance:
+    """What a control step meant in the sport."""
+
+    memory: Memory
+    terms: dict[str, Tensor]
+    """Reward terms by name, each (N, A); their sum is the reward."""
+    terminated: Tensor
+    """(N,) the episode ended in the sport: no bootstrap."""
+    metrics: dict[str, Tensor]
+    """(N,) episode metrics so far; NaN where undefined; read where the episode ended."""
+    success: Tensor
+    """(N,) bool, meaningful where terminated: promotes the curriculum."""
+    remaining_paid: Tensor | None = None
+    """(N,) bool: pay this step's reward for the steps left (outcome decided early)."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A sport, as data and functions. All functions are batched, pure and engine-free."""
+
+    name: str
+    config: type
+    scene: Callable[[Any, Body], Scene]
+    """(config, body) -> Scene."""
+    start: Callable[
+        [View, PhysicsState, Memory, torch.Generator, bool], tuple[PhysicsState, Memory]
+    ]
+    """(view, state, context, generator, training) -> state and context for a reset of every
+    world: moves fixtures, draws heights and targets. ``context`` holds the labels of the
+    reference frame a world starts from (empty tensors' NaN where it starts standing)."""
+    begin: Callable[[View, Memory], Memory]
+    """(view after the reset, context) -> memory of every world."""
+    features: Callable[[View, Memory], dict[str, Tensor]]
+    """(view, memory) -> goal features by name, each (N, A, k), in order."""
+    advance: Callable[[View, Memory], Advance]
+    metrics: Mapping[str, str]
+    """Episode metrics and their units."""
+    main_metric: str
+    max_steps: int
+    reward_scale: float = 1.0
+    body: str = "smpl"
+    equipment: tuple[str, ...] = ()
+    curriculum: Callable[[Any, int, torch.device], Memory] | None = None
+    """(config, num_worlds, device) -> curriculum state, (N,) tensors."""
+    promote: Callable[[View, Memory, Advance, Tensor], Memory] | None = None
+    """(view, memory, advance, ended (N,)) -> new curriculum state."""
+    age_at_start: bool = True
+    """Whether training starts episodes' truncation clocks at random ages."""
+    summary: str = ""
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+
+def progress(before: Tensor, now: Tensor, goal: Tensor) -> Tensor:
+    """(...) metres gained on ``goal`` since the last step: d(before, goal) - d(now, goal)."""
+    return (before - goal).norm(dim=-1) - (now - goal).norm(dim=-1)
+
+
+def clamp01(x: Tensor) -> Tensor:
+    """x limited to [0, 1]."""
+    return x.clamp(0.0, 1.0)
+
+
+def nan_where(mask: Tensor, value: Tensor) -> Tensor:
+    """``value`` with NaN where ``mask`` is true: an undefined metric."""
+    return torch.where(mask, torch.full_like(value, torch.nan), value)
