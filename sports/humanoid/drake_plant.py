@@ -15,6 +15,10 @@ sphere of its own (`points`), which meets the ground and nothing else, while the
 (`shapes`) meet everything but the ground.
 """
 
+# The stubs of Drake and MuJoCo type arrays, ports and modules more narrowly than they are.
+# pyright: reportArgumentType=false, reportCallIssue=false
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence

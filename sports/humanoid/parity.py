@@ -11,6 +11,10 @@ gives M_mj = T' M_D T, and C_mj = T' C_D because d/dt v_D = T d/dt qvel: the onl
 is R w_B, and d/dt (R w_B) = R d/dt w_B.
 """
 
+# The stubs of Drake and MuJoCo type arrays, ports and modules more narrowly than they are.
+# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from collections.abc import Iterator

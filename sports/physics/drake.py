@@ -11,6 +11,10 @@ has its own; their velocity is zero, as it is for a mocap body in MuJoCo. ``solr
 is a MuJoCo number and has no meaning here.
 """
 
+# The stubs of Drake and MuJoCo type arrays, ports and modules more narrowly than they are.
+# pyright: reportArgumentType=false, reportCallIssue=false
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import math
