@@ -260,15 +260,15 @@ def fit_links(
         skin = vertices[owner == row.name] - origin[row.name]
         if len(skin) < 4:
             raise ValueError(f"link '{row.name}' has {len(skin)} vertices of skin: at least 4")
+        offset = np.zeros(3) if row.parent is None else origin[row.name] - origin[row.parent]
         children = [origin[c.name] - origin[row.name] for c in table if c.parent == row.name]
         kind = row.shapes[0].kind
         if kind == "box":
             shape = _box(skin)
         else:
-            bone = np.mean(children, axis=0) if children else _tip(skin)
+            bone = np.mean(children, axis=0) if children else _tip(offset, skin)
             shape = _capsule(row.name, bone, skin)
         mass = row.shapes[0].mass / volume(row.shapes[0]) * volume(shape)
-        offset = np.zeros(3) if row.parent is None else origin[row.name] - origin[row.parent]
         fitted = Shape(shape.kind, shape.center, shape.size, mass, shape.end)
         links.append(Link(row.name, row.parent, _triple(offset), (fitted,), row.kp, row.kd))
     return tuple(links)
@@ -316,10 +316,9 @@ def _hull_volume(name: str, skin: np.ndarray) -> float:
         raise ValueError(f"the skin of link '{name}' is flat: it has no volume") from None
 
 
-def _tip(skin: np.ndarray) -> np.ndarray:
-    """End of a link without children: the far end of its skin, seen from the joint."""
-    direction = skin.mean(axis=0)
-    direction = direction / max(float(np.linalg.norm(direction)), 1e-9)
+def _tip(offset: np.ndarray, skin: np.ndarray) -> np.ndarray:
+    """End of a link without children: straight on from its parent, as far as its skin goes."""
+    direction = offset / max(float(np.linalg.norm(offset)), 1e-9)
     return direction * float((skin @ direction).max())
 
 

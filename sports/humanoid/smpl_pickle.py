@@ -73,39 +73,47 @@ class _Select(_Held):
     pass
 
 
-def _reconstruct_array(*args: Any) -> _Array:
-    return _Array(*args)
+class _Rebuilt(_Held):
+    """``copyreg._reconstructor(cls, base, state)``: an empty holder of the class."""
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> _Held:
+        wanted = args[0] if args else None
+        if not (isinstance(wanted, type) and issubclass(wanted, _Held)) or wanted is _Rebuilt:
+            raise Forbidden("it rebuilds an object that is not an array")
+        return wanted()
 
 
-def _reconstruct_object(cls: Any, base: Any = object, state: Any = None) -> _Held:
-    if not (isinstance(cls, type) and issubclass(cls, _Held)):
-        raise Forbidden("it rebuilds an object that is not an array")
-    return cls()
+class _Encoded(bytes):
+    """``_codecs.encode(text, "latin1")``: how pickles of protocol 2 write bytes."""
 
+    def __new__(cls, text: Any = None, encoding: Any = None) -> _Encoded:
+        if encoding != "latin1" or not isinstance(text, str):
+            raise Forbidden("it encodes text in another way than pickled bytes do")
+        return super().__new__(cls, text.encode("latin1"))
 
-def _encode(text: str, encoding: str = "latin1") -> bytes:
-    if encoding != "latin1" or not isinstance(text, str):
-        raise Forbidden("it encodes text in another way than pickled bytes do")
-    return text.encode("latin1")
+    def __setstate__(self, state: Any) -> None:
+        raise Forbidden("it gives bytes a state")
 
 
 class _NdarrayMark(_Held):
     """Stands where the file names the class numpy.ndarray."""
 
 
+# Holders are classes, never functions: a pickle may set attributes of a function that it is given,
+# but a class whose instances define __setstate__ refuses a state of its own.
 _KNOWN: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _NdarrayMark,
     ("numpy", "dtype"): _Dtype,
     ("collections", "OrderedDict"): OrderedDict,
-    ("_codecs", "encode"): _encode,
-    ("copyreg", "_reconstructor"): _reconstruct_object,
-    ("copy_reg", "_reconstructor"): _reconstruct_object,
+    ("_codecs", "encode"): _Encoded,
+    ("copyreg", "_reconstructor"): _Rebuilt,
+    ("copy_reg", "_reconstructor"): _Rebuilt,
     ("chumpy.ch", "Ch"): _Chumpy,
     ("chumpy", "Ch"): _Chumpy,
     ("chumpy.reordering", "Select"): _Select,
 }
 for _core in ("numpy.core", "numpy._core"):
-    _KNOWN[f"{_core}.multiarray", "_reconstruct"] = _reconstruct_array
+    _KNOWN[f"{_core}.multiarray", "_reconstruct"] = _Array
     _KNOWN[f"{_core}.multiarray", "scalar"] = _Scalar
     _KNOWN[f"{_core}.numeric", "_frombuffer"] = _FromBuffer
 for _kind, _holder in (("csc", _Csc), ("csr", _Csr)):
