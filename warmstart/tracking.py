@@ -1,0 +1,394 @@
+"""Closed-loop tracking of a reference motion in MuJoCo by sampling PD targets.
+
+An optimised motion replayed open loop drifts off at the first contact that is a little different.
+Here the PD targets are planned again at every control step: a batch of worlds starts from the
+present state, each plays the reference's targets (feed-forward torque included) plus a random
+spline, and the best decide what is played next. The result is a motion that MuJoCo really
+produced, with targets held over each control step as a policy holds them, so that it can seed
+training; its outcome is measured by the task's own rules.
+
+Method: sampling-based predictive control with rank-weighted elites (Howell 2022, Predictive
+Sampling, section 3; Williams 2017, Model Predictive Path Integral Control, for the averaging).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+
+from sports.env import Starts, make_env, make_scene
+from sports.humanoid.body import Body, load_body
+from sports.humanoid.mjcf import build_spec
+from sports.registry import task_names
+from sports.scene import Scene, humanoid_scene
+from warmstart.clip import Clip, clip_from_solution
+from warmstart.solution import Solution
+
+_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
+_State = tuple[np.ndarray, np.ndarray, np.ndarray]  # qpos, qvel, the solver's warm start
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Cost per control step of a candidate; each term is a mean over links or dofs."""
+
+    link_position: float = 60.0
+    """Per m^2 of distance of the links from the reference's, in the world."""
+    link_rotation: float = 3.0
+    """Per rad^2 (small angles) of the links' attitude."""
+    com_position: float = 100.0
+    """Per m^2 of distance of the centre of mass: it decides height and length."""
+    momentum: float = 10.0
+    """Per (m/s)^2 of the centre of mass's velocity: the flight is decided at take-off."""
+    spin: float = 0.02
+    """Per (kg m^2/s)^2 of angular momentum about the centre of mass: so is its rotation."""
+    joint_rate: float = 0.003
+    """Per (rad/s)^2."""
+    effort: float = 0.05
+    """Per squared share of the servo's range by which targets leave the reference's."""
+    bar: float = 400.0
+    """Per m by which the bar has moved."""
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Settings of the sampling."""
+
+    worlds: int = 96
+    """Candidates simulated at once."""
+    horizon: int = 14
+    """Control steps looked ahead."""
+    knot_every: int = 3
+    """Control steps between the knots of a random spline."""
+    iterations: int = 2
+    """Rounds of sampling per control step."""
+    noise: float = 0.15
+    """Standard deviation of the targets' spline, as a share of the servo's range effort / kp."""
+    elites: int = 10
+    """Candidates that are averaged, by rank."""
+    seed: int = 0
+    weights: Weights = Weights()
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A tracked motion and how close it came."""
+
+    clip: Clip
+    """What MuJoCo did, at the control rate, from the first frame to the end of the outcome."""
+    link_error: float
+    """Root mean square distance of the links from the reference's over its duration (m)."""
+    root_error: float
+    """Largest distance of the root from the reference's (m)."""
+    seconds: float
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """Kinematics of the reference at the control rate, T frames."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    ctrl: np.ndarray
+    link_pos: np.ndarray  # (T, B, 3)
+    link_quat: np.ndarray  # (T, B, 4)
+    whole: np.ndarray  # (T, 9) centre of mass, its velocity, angular momentum about it
+
+
+class _Worlds:
+    """A batch that plays candidates from one state."""
+
+    def __init__(self, scene: Scene, worlds: int, threads: int) -> None:
+        spec = build_spec(scene)
+        for sensor in list(spec.sensors):  # nobody reads forces here, and they cost time
+            spec.delete(sensor)
+        root = f"agent0/{scene.body.links[0].name}"
+        for kind in ("COM", "LINVEL", "ANGMOM"):
+            spec.add_sensor(
+                name=kind,
+                type=getattr(mujoco.mjtSensor, f"mjSENS_SUBTREE{kind}"),
+                objtype=mujoco.mjtObj.mjOBJ_BODY,
+                objname=root,
+            )
+        self.scene, self.model = scene, spec.compile()
+        self.batch = Batch(self.model, nsim=worlds, nthread=threads)
+        bind = self.batch.bind
+        self.qpos, self.qvel, self.ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
+        self.warm = bind("qacc_warmstart")
+        self.xpos, self.xquat, self.whole = bind("xpos"), bind("xquat"), bind("sensordata")
+        self.links = np.array(
+            [self.model.body(f"agent0/{name}").id for name in scene.body.link_names]
+        )
+
+    def put(self, count: int, qpos: np.ndarray, qvel: np.ndarray, warm: np.ndarray) -> None:
+        """Puts the first ``count`` worlds into one state."""
+        self.ids = np.arange(count)
+        self.qpos[:count], self.qvel[:count], self.warm[:count] = qpos, qvel, warm
+        self.batch.forward(ids=self.ids, stage=_VEL)
+
+    def step(self, ctrl: np.ndarray) -> None:
+        """One control step of the worlds that were put."""
+        self.ctrl[self.ids] = ctrl
+        self.batch.step(ids=self.ids, nstep=self.scene.substeps, stage=_VEL)
+
+    def kinematics(self, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Of T frames: link positions (T, B, 3), attitudes (T, B, 4) and ``whole`` (T, 9)."""
+        data = mujoco.MjData(self.model)
+        rows = []
+        for p, v in zip(qpos, qvel):
+            data.qpos[self.scene.agent_qpos(0)] = p
+            data.qvel[self.scene.agent_qvel(0)] = v
+            mujoco.mj_forward(self.model, data)
+            rows.append((data.xpos[self.links], data.xquat[self.links], data.sensordata.copy()))
+        return tuple(np.array(x) for x in zip(*rows))
+
+
+def track(
+    reference: Clip | Solution,
+    scene: Scene | None = None,
+    settings: Tracking | None = None,
+    *,
+    threads: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Tracked:
+    """Follows a reference in MuJoCo in closed loop; the clip holds the motion that came out.
+
+    Without a scene, that of the reference's problem is used (``meta["problem"]``, with its
+    ``asked`` options that the task knows), or the athlete alone where no task has that name.
+    ``progress(step, steps)`` is called after every control step. Where the reference ends, its
+    last targets are held until the task has decided the outcome. Raises ValueError when the
+    reference is not of the scene's body, RuntimeError when the simulation diverges.
+    """
+    settings = settings or Tracking()
+    clip = clip_from_solution(reference) if isinstance(reference, Solution) else reference
+    if scene is None:
+        scene = scene_of(clip)
+    if scene.body.name != clip.body:
+        raise ValueError(f"the clip is of body '{clip.body}', the scene of '{scene.body.name}'")
+    begin = time.perf_counter()
+    worlds = _Worlds(scene, settings.worlds, threads)
+    frames = _reference(clip, worlds)
+    qpos, qvel, ctrl = _follow(frames, worlds, settings, progress)
+    steps = len(frames.ctrl) - 1
+    tracked = replace(
+        clip,
+        fps=1.0 / scene.control_timestep,
+        qpos=qpos,
+        qvel=qvel,
+        ctrl=ctrl,
+        meta={**clip.meta, "source": f"{clip.meta.get('source', 'clip')}, tracked in MuJoCo"},
+    )
+    if clip.meta.get("problem") in task_names():
+        tracked, outcome = play(tracked, clip.meta["problem"], scene_options(clip), scene.body)
+        tracked.meta["achieved"] = outcome
+    links, *_ = worlds.kinematics(tracked.qpos[: steps + 1], tracked.qvel[: steps + 1])
+    root = np.linalg.norm(tracked.qpos[: steps + 1, :3] - frames.qpos[: len(links), :3], axis=1)
+    error = np.linalg.norm(links - frames.link_pos[: len(links)], axis=2)
+    return Tracked(
+        clip=tracked,
+        link_error=float(np.sqrt(np.mean(error**2))),
+        root_error=float(root.max()),
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def scene_options(clip: Clip) -> dict[str, Any]:
+    """The options of the clip's task that its ``asked`` outcome sets (``bar_height``)."""
+    asked = clip.meta.get("asked")
+    known = ("bar_height",)
+    return {k: asked[k] for k in known if isinstance(asked, dict) and k in asked}
+
+
+def body_of(clip: Clip) -> Body:
+    """The athlete of a clip at the strength its metadata names (``paper`` without one)."""
+    return load_body(clip.body, strength=clip.meta.get("strength", "paper"))
+
+
+def scene_of(clip: Clip) -> Scene:
+    """The scene of the clip's problem, or the athlete alone where no task has that name."""
+    problem = clip.meta.get("problem")
+    if problem in task_names():
+        return make_scene(
+            problem, strength=clip.meta.get("strength", "paper"), options=scene_options(clip)
+        )
+    return humanoid_scene(body_of(clip))
+
+
+def play(
+    clip: Clip, task: str, options: dict[str, Any], body: Body, timestep_divisor: int = 1
+) -> tuple[Clip, dict[str, float]]:
+    """Plays the clip's targets open loop from its first frame in the task's environment.
+
+    Returns the motion that came out, at the control rate until the task ended the episode, and
+    the task's metrics at that moment (those that are not NaN). The environment rounds states to
+    float32 and its actions are limited, exactly as in training.
+    """
+    assert clip.ctrl is not None
+    starts = Starts(
+        qpos=torch.tensor(clip.qpos[:1], dtype=torch.float32),
+        qvel=torch.tensor(clip.qvel[:1], dtype=torch.float32),
+        context={},
+        probability=1.0,
+    )
+    env = make_env(
+        task,
+        num_worlds=1,
+        strength=body.strength,
+        limits=body.limits,
+        training=False,
+        options=options,
+        starts=starts,
+        timestep_divisor=timestep_divisor,
+    )
+    env.keep_snapshot = True
+    q, v = env.physics.scene.agent_qpos(0), env.physics.scene.agent_qvel(0)
+    qpos, qvel, ctrl, metrics = [clip.qpos[0]], [clip.qvel[0]], [], {}
+    for step in range(env.max_steps):
+        target = clip.ctrl[min(step, len(clip.ctrl) - 1)]
+        action = torch.tensor(target / body.action_scale(), dtype=torch.float32)
+        result = env.step(action[None, None])
+        ctrl.append(target)
+        metrics = {k: float(m[0]) for k, m in result.metrics.items()}
+        if not bool(result.valid[0]):
+            raise RuntimeError(f"the simulation diverged at step {step} of the replayed clip")
+        qpos.append(env.final_snapshot["qpos"][0, q].double().numpy())
+        qvel.append(env.final_snapshot["qvel"][0, v].double().numpy())
+        if bool(result.terminated[0] | result.truncated[0]):
+            break
+    rate = 1.0 / env.physics.scene.control_timestep
+    env.close()
+    ctrl.append(ctrl[-1])
+    out = replace(
+        clip,
+        fps=rate,
+        qpos=np.array(qpos),
+        qvel=np.array(qvel),
+        ctrl=np.array(ctrl),
+        meta=dict(clip.meta),
+    )
+    return out, {k: m for k, m in metrics.items() if np.isfinite(m)}
+
+
+def _reference(clip: Clip, worlds: _Worlds) -> _Reference:
+    scene = worlds.scene
+    rate = 1.0 / scene.control_timestep
+    if abs(clip.fps - rate) > 1e-6:
+        clip = clip.resample(rate)
+    limit = scene.body.action_scale()
+    ctrl = clip.ctrl if clip.ctrl is not None else clip.qpos[:, 7:]
+    kinematics = worlds.kinematics(clip.qpos, clip.qvel)
+    return _Reference(clip.qpos, clip.qvel, np.clip(ctrl, -limit, limit), *kinematics)
+
+
+def _spline(knots: np.ndarray, steps: int, every: int) -> np.ndarray:
+    """(..., steps, n) piecewise linear curve through knots (..., K, n) ``every`` steps apart."""
+    x = np.arange(steps) / every
+    k = np.minimum(x.astype(int), knots.shape[-2] - 2)
+    s = (x - k)[:, None]
+    return (1 - s) * knots[..., k, :] + s * knots[..., k + 1, :]
+
+
+def _follow(
+    frames: _Reference,
+    worlds: _Worlds,
+    settings: Tracking,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The receding horizon loop: qpos (T, 7 + n), qvel (T, 6 + n) and ctrl (T, n)."""
+    scene, body, n = worlds.scene, worlds.scene.body, settings.worlds
+    rng, weights = np.random.default_rng(settings.seed), settings.weights
+    unit = np.minimum(body.array("effort") / body.array("kp"), 0.5)
+    limit = body.action_scale()
+    q, v = scene.agent_qpos(0), scene.agent_qvel(0)
+    state_q, state_v = scene.default_qpos(), np.zeros(scene.nv)
+    state_q[q], state_v[v] = frames.qpos[0], frames.qvel[0]
+    warm = np.zeros(scene.nv)
+    steps, every = len(frames.ctrl) - 1, settings.knot_every
+    knots = (settings.horizon - 1) // every + 2
+    plan = np.zeros((settings.horizon, body.num_dofs))  # added to the reference's targets
+    elites = min(settings.elites, n)
+    ranks = np.log(elites + 0.5) - np.log(np.arange(1, elites + 1))
+    ranks /= ranks.sum()
+    out_q, out_v, out_u = [state_q[q].copy()], [state_v[v].copy()], []
+
+    def cost_of(offset: np.ndarray, ahead: np.ndarray, state: _State) -> np.ndarray:
+        targets = np.clip(frames.ctrl[ahead] + offset[:, : len(ahead)], -limit, limit)
+        cost = _rollout(frames, worlds, targets, int(ahead[0]), state, weights)
+        return cost + weights.effort * np.mean((offset / unit) ** 2, axis=(1, 2)) * len(ahead)
+
+    for now in range(steps):
+        ahead = np.arange(now, min(now + settings.horizon, steps))
+
+        state = (state_q, state_v, warm)
+        known = [plan, np.zeros_like(plan)]
+        for round_ in range(settings.iterations):
+            scale = settings.noise * 0.6**round_ * unit
+            noise = rng.standard_normal((n, knots, body.num_dofs)) * scale
+            offset = plan + _spline(noise, settings.horizon, every)
+            offset[: len(known)] = known
+            best = np.argsort(cost_of(offset, ahead, state), kind="stable")[: settings.elites]
+            plan = np.einsum("e,ehn->hn", ranks[: len(best)], offset[best])
+            known = [plan, offset[best[0]]]
+        # An average of good candidates need not be good: play the better one.
+        plan = known[int(np.argmin(cost_of(np.array(known), ahead, state)))]
+        control = np.clip(frames.ctrl[now] + plan[0], -limit, limit)
+        worlds.put(1, *state)
+        worlds.step(control[None])
+        state_q, state_v, warm = worlds.qpos[0].copy(), worlds.qvel[0].copy(), worlds.warm[0].copy()
+        if not np.isfinite(state_q).all() or np.abs(state_v).max() > 200.0:
+            raise RuntimeError(f"the simulation diverged at step {now} of the tracked clip")
+        out_q.append(state_q[q].copy())
+        out_v.append(state_v[v].copy())
+        out_u.append(control)
+        plan = np.concatenate([plan[1:], plan[-1:]])
+        if progress is not None:
+            progress(now + 1, steps)
+    out_u.append(frames.ctrl[-1])
+    return np.array(out_q), np.array(out_v), np.array(out_u)
+
+
+def _rollout(
+    frames: _Reference,
+    worlds: _Worlds,
+    targets: np.ndarray,
+    now: int,
+    state: _State,
+    weights: Weights,
+) -> np.ndarray:
+    """(N,) cost of N target sequences (N, H, n) from one state."""
+    scene = worlds.scene
+    v = scene.agent_qvel(0)
+    bar = scene.object_qpos("bar") if any(o.name == "bar" for o in scene.free_objects) else None
+    count = len(targets)
+    worlds.put(count, *state)
+    cost = np.zeros(count)
+    for k in range(targets.shape[1]):
+        worlds.step(targets[:, k])
+        at = now + k + 1
+        pos, quat = worlds.xpos[:count, worlds.links], worlds.xquat[:count, worlds.links]
+        rate = worlds.qvel[:count, v][:, 6:] - frames.qvel[at, 6:]
+        whole = (worlds.whole[:count] - frames.whole[at]) ** 2
+        distance = np.sum((pos - frames.link_pos[at]) ** 2, axis=2).mean(1)
+        dot = np.einsum("nbi,bi->nb", quat, frames.link_quat[at])
+        step = (
+            weights.link_position * distance
+            + weights.link_rotation * (4.0 * (1.0 - dot**2)).mean(1)
+            + weights.com_position * whole[:, :3].sum(1)
+            + weights.momentum * whole[:, 3:6].sum(1)
+            + weights.spin * whole[:, 6:].sum(1)
+            + weights.joint_rate * np.mean(rate**2, axis=1)
+        )
+        if bar is not None:
+            shift = np.linalg.norm(
+                worlds.qpos[:count, bar][:, :3] - scene.default_qpos()[bar][:3], axis=1
+            )
+            step += weights.bar * np.maximum(shift - 0.005, 0.0)
+        cost += step
+    return np.nan_to_num(cost, nan=1e9, posinf=1e9)
