@@ -95,13 +95,13 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
     if obj.motion == "free":
         node.add_freejoint(name=obj.name)
     for shape in obj.shapes:
-        fields: dict[str, object] = dict(
-            friction=(obj.friction, 0.005, 0.0001),
-            contype=_SOLID,
-            conaffinity=_SOLID | (_GROUND if obj.meets_ground else 0),
-            condim=3,
-            rgba=obj.rgba,
-        )
+        fields: dict[str, object] = {
+            "friction": (obj.friction, 0.005, 0.0001),
+            "contype": _SOLID,
+            "conaffinity": _SOLID | (_GROUND if obj.meets_ground else 0),
+            "condim": 3,
+            "rgba": obj.rgba,
+        }
         if obj.solref is not None:
             fields["solref"] = obj.solref
         _add_shape(node, shape, **fields)

@@ -74,7 +74,7 @@ class Physics(Protocol):
     """(N, O, 3) world frame."""
     bad: Tensor
     """(N,) bool: the last step left NaN or absurd numbers, or overflowed a buffer, in this
-    world. The caller must reset it; its tensors are finite but meaningless."""
+    world. The caller must reset it; until then its tensors are meaningless."""
     nan_worlds: int | Tensor
     """Worlds found bad for numbers so far (a device tensor where reading it would wait)."""
     overflow: int | Tensor

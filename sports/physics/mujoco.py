@@ -79,7 +79,8 @@ class MujocoPhysics:
                 np.copyto(forces, now, where=more[:, :, None])
                 np.copyto(largest, norm, where=more)
         self._forces = np.nan_to_num(forces)
-        self._read()
+        with np.errstate(over="ignore", invalid="ignore"):  # diverged worlds, found just below
+            self._read()
         self.bad = diverged(self.qpos, self.qvel)
         if self.bad.any():
             self.nan_worlds += int(self.bad.sum())

@@ -1,0 +1,211 @@
+"""MuJoCo Warp: thousands of worlds on one GPU, a control step in one CUDA graph.
+
+The graph runs the substeps, keeps each contact force from the substep in which it was largest,
+and refreshes kinematics and velocities so that what a task reads is current. The tensors of the
+protocol are views of the engine's memory: nothing is copied, and nothing waits for the device.
+Without a GPU the same code runs on Warp's CPU device (slowly; for tests).
+"""
+
+from __future__ import annotations
+
+import mujoco
+import mujoco_warp as mjw
+import torch
+import warp as wp
+from torch import Tensor
+
+from sports.humanoid.mjcf import body_name, build_model
+from sports.physics.base import Geometry, PhysicsState, diverged
+from sports.scene import Scene
+
+ITERATIONS, LINE_SEARCH = 5, 8
+"""Newton iterations and line-search steps: 10 / 20 cost 10 % more (measured)."""
+
+
+@wp.kernel
+def _keep_largest(
+    sensors: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    first: int,
+    forces: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    largest: wp.array2d(dtype=float),  # type: ignore[valid-type]
+):
+    world, s = wp.tid()
+    x = sensors[world, 3 * s]
+    y = sensors[world, 3 * s + 1]
+    z = sensors[world, 3 * s + 2]
+    square = x * x + y * y + z * z
+    if first == 1 or square > largest[world, s]:
+        largest[world, s] = square
+        forces[world, s, 0] = x
+        forces[world, s, 1] = y
+        forces[world, s, 2] = z
+
+
+class WarpPhysics:
+    """The ``warp`` engine; see :class:`sports.physics.base.Physics` for the tensors."""
+
+    engine = "warp"
+
+    def __init__(
+        self,
+        scene: Scene,
+        num_worlds: int,
+        device: str | None = None,
+        iterations: int = ITERATIONS,
+        line_search: int = LINE_SEARCH,
+    ) -> None:
+        """``device``: a torch device; None takes the current GPU. Raises RuntimeError when there
+        is no GPU and ``device`` does not say ``cpu``."""
+        if device is None:
+            if not torch.cuda.is_available():
+                raise RuntimeError(
+                    "engine 'warp' found no GPU; use --engine mujoco (or device='cpu' in tests)"
+                )
+            device = f"cuda:{torch.cuda.current_device()}"
+        self.device = torch.device(device)
+        self.scene, self.num_worlds = scene, num_worlds
+        wp.config.quiet = True
+        wp.init()
+        self._wp_device = wp.device_from_torch(self.device)
+        self.model = model = build_model(scene)
+        # Warp never resets a diverged world by itself, and does not know the flag that says so.
+        model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        model.opt.iterations, model.opt.ls_iterations = iterations, line_search
+        agents, links, n = scene.num_agents, scene.body.num_links, num_worlds
+        ids = [
+            model.body(body_name(a, link)).id
+            for a in range(agents)
+            for link in scene.body.link_names
+        ] + [model.body(o.name).id for o in scene.free_objects]
+        if ids != list(range(1, len(ids) + 1)):
+            raise RuntimeError(f"scene '{scene.name}': athletes and balls are not listed first")
+
+        rows = scene.rows_per_world or 100 + 4 * links * agents + 48 * len(scene.free_objects)
+        contacts = scene.contacts_per_world or 40 + (links * agents) // 2
+        with wp.ScopedDevice(self._wp_device):
+            self.m = mjw.put_model(model)
+            self.m.opt.warn_overflow = 0  # counted below, never printed
+            self.d = mjw.make_data(model, nworld=n, nconmax=contacts, njmax=rows)
+        view = wp.to_torch
+        d = self.d
+        self.qpos, self.qvel = view(d.qpos), view(d.qvel)
+        self._ctrl, self._warmstart = view(d.ctrl), view(d.qacc_warmstart)
+        self.mocap_pos = view(d.mocap_pos) if model.nmocap else torch.zeros(n, 0, 3).to(self.device)
+        self._overflow = view(d.overflow)
+        k, o = agents * links, len(scene.free_objects)
+        xpos, xquat = view(d.xpos)[:, 1 : 1 + k + o], view(d.xquat)[:, 1 : 1 + k + o]
+        self._cvel = view(d.cvel)[:, 1 : 1 + k + o]
+        self._com = view(d.subtree_com)
+        self._roots = torch.tensor(model.body_rootid[1 : 1 + k + o], device=self.device).long()
+        self.body_pos = xpos[:, :k].unflatten(1, (agents, links))
+        self.body_quat = xquat[:, :k].unflatten(1, (agents, links))
+        self.object_pos, self.object_quat = xpos[:, k:], xquat[:, k:]
+        self._split, self._shape = k, (agents, links)
+
+        sensors = model.nsensordata // 3
+        self._forces = torch.zeros(n, sensors, 3, device=self.device)
+        self._largest = torch.zeros(n, sensors, device=self.device)
+        self._wp_forces = wp.from_torch(self._forces)
+        self._wp_largest = wp.from_torch(self._largest)
+        self.ground_force = self._forces[:, :k].unflatten(1, (agents, links))
+        self.bad = torch.zeros(n, dtype=torch.bool, device=self.device)
+        self.nan_worlds = torch.zeros((), dtype=torch.long, device=self.device)
+        self.overflow = torch.zeros((), dtype=torch.long, device=self.device)
+        self.geometry = Geometry(scene.body, self.device)
+        qpos0 = torch.tensor(scene.default_qpos(), dtype=torch.float32, device=self.device)
+        self.qpos.copy_(qpos0.expand_as(self.qpos))
+        self._step_graph = self._capture(self._substeps)
+        self._refresh_graph = self._capture(self._refresh)
+        # The captures ran once for warming up: start over.
+        self.qpos.copy_(qpos0.expand_as(self.qpos))
+        for t in (self.qvel, self._ctrl, self._warmstart, self._forces, self._overflow):
+            t.zero_()
+        self._run(self._refresh_graph, self._refresh)
+        self._derive()
+
+    def step(self, ctrl: Tensor) -> None:
+        self._ctrl.copy_(ctrl)
+        self.step_graph()
+        self._derive()
+        full = self._overflow != 0
+        wrong = diverged(self.qpos, self.qvel)
+        self.bad = wrong | full
+        self.nan_worlds = self.nan_worlds + wrong.sum()
+        self.overflow = self.overflow + full.sum()
+        self._overflow.zero_()
+
+    def step_graph(self) -> None:
+        """Runs only the captured substeps, for benchmarks."""
+        self._run(self._step_graph, self._substeps)
+
+    def reset(self, mask: Tensor, state: PhysicsState) -> None:
+        row = mask[:, None]
+        self.qpos.copy_(torch.where(row, state.qpos, self.qpos))
+        self.qvel.copy_(torch.where(row, state.qvel, self.qvel))
+        self._warmstart.masked_fill_(row, 0.0)
+        if self.mocap_pos.shape[1]:
+            self.mocap_pos.copy_(torch.where(row[..., None], state.mocap_pos, self.mocap_pos))
+        self._forces.masked_fill_(row[..., None], 0.0)
+        self._run(self._refresh_graph, self._refresh)
+        self._derive()
+
+    def extent(self, direction: Tensor) -> Tensor:
+        return self.geometry.extent(self.body_pos, self.body_quat, direction)
+
+    def extra_state(self) -> dict[str, Tensor]:
+        """The solver's warm start."""
+        return {"qacc_warmstart": self._warmstart.clone()}
+
+    def load_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Restores :meth:`extra_state`; call after ``reset``."""
+        self._warmstart.copy_(state["qacc_warmstart"])
+
+    def close(self) -> None:
+        self._step_graph = self._refresh_graph = None
+
+    def _substeps(self) -> None:
+        d = self.d
+        for i in range(self.scene.substeps):
+            mjw.step(self.m, d)
+            wp.launch(
+                _keep_largest,
+                dim=self._largest.shape,
+                inputs=[d.sensordata, int(i == 0)],
+                outputs=[self._wp_forces, self._wp_largest],
+            )
+        self._refresh()
+
+    def _refresh(self) -> None:
+        mjw.kinematics(self.m, self.d)
+        mjw.com_pos(self.m, self.d)
+        mjw.com_vel(self.m, self.d)
+
+    def _capture(self, work) -> wp.Graph | None:
+        with wp.ScopedDevice(self._wp_device):
+            work()  # compiles kernels outside the capture
+            if self.device.type != "cuda":
+                return None
+            with wp.ScopedCapture() as capture:
+                work()
+            return capture.graph
+
+    def _run(self, graph: wp.Graph | None, work) -> None:
+        with wp.ScopedDevice(self._wp_device):
+            if graph is None:
+                work()
+            else:
+                # On torch's stream, so that both libraries keep one order.
+                stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
+                wp.capture_launch(graph, stream=stream)
+
+    def _derive(self) -> None:
+        """Velocities at the link origins; the engine's are at the tree's centre of mass."""
+        spin, velocity = self._cvel[..., :3], self._cvel[..., 3:]
+        arm = torch.cat((self.body_pos.flatten(1, 2), self.object_pos), dim=1)
+        arm = arm - self._com[:, self._roots]
+        linear = velocity + torch.linalg.cross(spin, arm)
+        k = self._split
+        self.body_linvel = linear[:, :k].unflatten(1, self._shape)
+        self.body_angvel = spin[:, :k].unflatten(1, self._shape)
+        self.object_linvel, self.object_angvel = linear[:, k:], spin[:, k:]
+        self.pair_force = self._forces[:, k:].norm(dim=-1)

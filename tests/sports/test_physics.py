@@ -1,0 +1,219 @@
+"""Engines against closed forms, against each other, and against a permutation of the worlds."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from sports.env import make_env, make_scene
+from sports.frames import Heading, proprioception
+from sports.humanoid import load_body
+from sports.physics import Geometry, PhysicsState, default_state, make_physics
+from sports.scene import Start, humanoid_scene
+
+
+def cpu(scene, n, **options):
+    return make_physics("mujoco", scene, n, threads=2, **options)
+
+
+def test_a_tossed_athlete_follows_the_parabola():
+    """The centre of mass in flight, whatever the limbs do: closed form over the time steps."""
+    scene = dataclasses.replace(humanoid_scene(load_body()), timestep=1 / 960, substeps=32)
+    physics = cpu(scene, 2)
+    state = default_state(scene, 2, "cpu")
+    state.qpos[:, 2] += 4.0
+    state.qvel[:, :3] = torch.tensor((3.0, 1.0, 2.0))
+    physics.reset(torch.tensor([True, True]), state)
+    geometry = Geometry(scene.body, "cpu")
+    com, velocity = (x.clone() for x in geometry.center_of_mass(physics, 0))
+    assert torch.allclose(velocity, torch.tensor((3.0, 1.0, 2.0)), atol=1e-5)
+    generator = torch.Generator().manual_seed(1)
+    steps = 20
+    for _ in range(steps):
+        physics.step(0.3 * torch.randn(2, scene.nu, generator=generator))
+    now, now_velocity = geometry.center_of_mass(physics, 0)
+    t = steps * scene.control_timestep
+    # Semi-implicit Euler at step h falls g t (t + h) / 2.
+    gravity = torch.tensor((0.0, 0.0, -9.81))
+    expected = com + velocity * t + gravity * t * (t + scene.timestep) / 2
+    assert (now - expected).abs().max() < 5e-3
+    assert (now_velocity - velocity - gravity * t).abs().max() < 2e-2
+
+
+def test_standing_weighs_what_the_table_says():
+    """Momentum theorem: the mean ground force over time is m (g + change of velocity / time)."""
+    scene = dataclasses.replace(humanoid_scene(load_body()), substeps=1)
+    physics = cpu(scene, 1)
+    geometry = Geometry(scene.body, "cpu")
+    for _ in range(120):
+        physics.step(torch.zeros(1, scene.nu))
+    before = geometry.center_of_mass(physics, 0)[1].clone()
+    total = torch.zeros(3)
+    for _ in range(120):
+        physics.step(torch.zeros(1, scene.nu))
+        total += physics.ground_force[0].sum((0, 1))
+    change = geometry.center_of_mass(physics, 0)[1] - before
+    expected = scene.body.mass * (torch.tensor((0.0, 0.0, 9.81)) + change[0] / 1.0)
+    assert (total / 120 - expected).abs().max() < 2.0
+    assert {
+        scene.body.link_names[i] for i in physics.ground_force[0, 0].norm(dim=-1).nonzero()[:, 0]
+    } <= {"L_Ankle", "R_Ankle", "L_Toe", "R_Toe"}
+
+
+def test_link_velocities_are_the_derivatives_of_link_positions():
+    scene = dataclasses.replace(humanoid_scene(load_body()), timestep=1e-4, substeps=1)
+    physics = cpu(scene, 2)
+    state = default_state(scene, 2, "cpu")
+    state.qpos[:, 2] += 2.0
+    state.qvel = torch.randn(2, scene.nv, generator=torch.Generator().manual_seed(3))
+    physics.reset(torch.tensor([True, True]), state)
+    before = physics.body_pos.clone()
+    physics.step(torch.zeros(2, scene.nu))
+    difference = (physics.body_pos - before) / scene.timestep
+    # Semi-implicit Euler moves with the new velocity; float32 positions resolve 2.4e-3 m/s.
+    assert (difference - physics.body_linvel).abs().max() < 1e-2
+
+
+def test_extent_agrees_with_the_support_points():
+    scene = humanoid_scene(load_body(equipment=("racket",)))
+    physics = cpu(scene, 3)
+    state = default_state(scene, 3, "cpu")
+    state.qpos[:, 7:] = torch.randn(3, scene.nu, generator=torch.Generator().manual_seed(0))
+    physics.reset(torch.ones(3, dtype=torch.bool), state)
+    direction = torch.nn.functional.normalize(torch.tensor((0.3, -0.8, 0.5)), dim=0)
+    reach = physics.extent(direction)
+    geometry = physics.geometry
+    points = geometry.world_points(physics.body_pos, physics.body_quat)
+    along = points @ direction + geometry.radii
+    for link in range(scene.body.num_links):
+        best = along[..., geometry.owner == link].amax(-1)
+        assert torch.allclose(reach[..., link], best, atol=1e-5)
+
+
+def test_mujoco_and_warp_stand_together():
+    """2 s of standing under PD with contacts and with the bar resting: |dqpos| < 1e-5."""
+    pytest.importorskip("mujoco_warp")
+    scene = make_scene("high_jump")
+    c = cpu(scene, 2)
+    w = make_physics("warp", scene, 2, device="cpu")
+    ctrl = torch.zeros(2, scene.nu)
+    worst = 0.0
+    for _ in range(60):
+        c.step(ctrl)
+        w.step(ctrl)
+        worst = max(worst, float((c.qpos - w.qpos).abs().max()))
+    print(f"mujoco against warp, 2 s standing: |dqpos| = {worst:.1e}")
+    assert worst < 1e-5
+    assert (c.body_linvel - w.body_linvel).abs().max() < 1e-3
+    assert (c.ground_force - w.ground_force).abs().max() < 0.1
+    assert int(w.overflow) == 0 and int(w.nan_worlds) == 0
+
+
+@pytest.mark.parametrize("task", ["high_jump", "long_jump"])
+def test_permuting_the_worlds_permutes_every_output(task):
+    n = 6
+    order = torch.tensor([3, 0, 5, 1, 4, 2])
+    options = {"bar_height": 1.0} if task == "high_jump" else {}
+    straight = make_env(task, num_worlds=n, training=False, options=options)
+    permuted = make_env(task, num_worlds=n, training=False, options=options)
+    scene = straight.physics.scene
+    state = default_state(scene, n, "cpu")
+    generator = torch.Generator().manual_seed(7)
+    state.qpos[:, 7:76] = 0.1 * torch.randn(n, 69, generator=generator)
+    state.qpos[:, 0] = torch.linspace(0.0, 21.0, n)
+    everyone = torch.ones(n, dtype=torch.bool)
+    for env, rows in ((straight, torch.arange(n)), (permuted, order)):
+        rows_state = PhysicsState(state.qpos[rows], state.qvel[rows], state.mocap_pos[rows])
+        env.physics.reset(everyone, rows_state)
+        context = {"bar_height": torch.full((n,), 1.0)}
+        env.memory = env.task.begin(env.view, context)
+    for _ in range(12):
+        action = 0.3 * torch.randn(n, 1, 69, generator=generator)
+        a, b = straight.step(action), permuted.step(action[order])
+        for name in ("obs", "final_obs", "reward", "terminated", "truncated", "valid"):
+            assert torch.equal(getattr(a, name)[order], getattr(b, name)), name
+        for name, value in a.terms.items():
+            assert torch.equal(value[order], b.terms[name]), name
+        for name, value in a.metrics.items():
+            assert torch.equal(value[order].nan_to_num(-1), b.metrics[name].nan_to_num(-1)), name
+
+
+def test_a_broken_world_is_counted_reset_and_alone():
+    env = make_env("long_jump", num_worlds=4, training=False)
+    clean = make_env("long_jump", num_worlds=4, training=False)
+    action = torch.zeros(4, 1, 69)
+    env.step(action), clean.step(action)
+    state = PhysicsState(env.physics.qpos.clone(), env.physics.qvel.clone(), env.physics.mocap_pos)
+    state.qvel[2, 10] = 1e6
+    env.physics.reset(torch.tensor([False, False, True, False]), state)
+    result, reference = env.step(action), clean.step(action)
+    assert result.valid.tolist() == [True, True, False, True]
+    assert env.physics.nan_worlds == 1
+    assert torch.isfinite(result.obs).all() and torch.isfinite(result.reward).all()
+    others = torch.tensor([0, 1, 3])
+    assert torch.equal(result.obs[others], reference.obs[others])
+    for _ in range(3):
+        assert env.step(action).valid.all()
+
+
+def test_resets_are_decided_by_the_seed():
+    a, b, c = (make_env("high_jump", num_worlds=3, seed=s) for s in (5, 5, 6))
+    assert torch.equal(a.physics.qpos, b.physics.qpos) and torch.equal(a.age, b.age)
+    assert not torch.equal(a.physics.qpos, c.physics.qpos)
+
+
+def test_a_saved_state_continues_bit_for_bit():
+    generator = torch.Generator().manual_seed(2)
+    actions = 0.2 * torch.randn(24, 4, 1, 69, generator=generator)
+    first = make_env("high_jump", num_worlds=4, seed=1)
+    for action in actions[:12]:
+        first.step(action)
+    saved = {k: v.clone() for k, v in first.state_dict().items()}
+    second = make_env("high_jump", num_worlds=4, seed=9)
+    second.load_state_dict(saved)
+    for action in actions[12:]:
+        a, b = first.step(action), second.step(action)
+        assert torch.equal(a.obs, b.obs) and torch.equal(a.reward, b.reward)
+
+
+def test_two_athletes_share_a_world():
+    """The agent axis: far apart, each does what one alone does, in its own heading frame."""
+    body = load_body()
+    alone = cpu(humanoid_scene(body), 1)
+    pair = cpu(
+        dataclasses.replace(humanoid_scene(body), agents=(Start(0, 0, 0), Start(5, 3, 2.0))), 1
+    )
+    generator = torch.Generator().manual_seed(4)
+    for physics in (alone, pair):  # in the air: friction's pyramid has a direction
+        state = default_state(physics.scene, 1, "cpu")
+        for agent in range(physics.scene.num_agents):
+            state.qpos[:, physics.scene.agent_qpos(agent).start + 2] += 3.0
+        physics.reset(torch.tensor([True]), state)
+    for _ in range(10):
+        ctrl = 0.2 * torch.randn(1, body.num_dofs, generator=generator)
+        alone.step(ctrl)
+        pair.step(torch.cat((ctrl, ctrl), dim=1))
+    one = proprioception(alone, Heading(alone.body_quat[:, :, 0]))
+    two = proprioception(pair, Heading(pair.body_quat[:, :, 0]))
+    assert two.shape == (1, 2, 358)
+    assert (two[:, 0] - one[:, 0]).abs().max() < 1e-3
+    assert (two[:, 1] - one[:, 0]).abs().max() < 1e-3
+
+
+def test_wrong_use_is_one_sentence():
+    with pytest.raises(ValueError, match="unknown task 'curling'; known: high_jump"):
+        make_env("curling")
+    with pytest.raises(ValueError, match="no option 'bar'; it has: bar_height, curriculum"):
+        make_env("high_jump", options={"bar": 1.0})
+    with pytest.raises(ValueError, match=r"between 0\.1 and 3\.0"):
+        make_env("high_jump", options={"bar_height": 30.0})
+    with pytest.raises(ValueError, match="at least 1, not 0"):
+        make_env("high_jump", num_worlds=0)
+    with pytest.raises(ValueError, match="unknown engine 'bullet'"):
+        make_env("high_jump", engine="bullet")
+    with pytest.raises(ValueError, match="action has shape"):
+        make_env("long_jump", num_worlds=2).step(torch.zeros(2, 69))
+    if not torch.cuda.is_available():
+        pytest.importorskip("mujoco_warp")
+        with pytest.raises(RuntimeError, match="found no GPU"):
+            make_env("long_jump", engine="warp", num_worlds=2)
