@@ -16,7 +16,6 @@ VENV := .venv
 PY := $(VENV)/bin/python
 PINS := pyproject.toml constraints.txt
 NOTEBOOKS := $(wildcard notebooks/*.ipynb)
-export PATH := $(CURDIR)/$(VENV)/bin:$(PATH)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: study test lint clean-venv
@@ -29,10 +28,8 @@ test: $(VENV)/.installed-dev
 		--nbmake --nbmake-timeout=120 tests $(NOTEBOOKS)
 
 lint: $(VENV)/.installed-dev
-	$(PY) -m ruff check .
-	$(PY) -m ruff format --check .
-	$(PY) -m pyright
-	$(VENV)/bin/lint-imports
+	@status=0; for check in "ruff check ." "ruff format --check ." pyright lint-imports; do \
+		echo "$$check"; $(VENV)/bin/$$check || status=1; done; exit $$status
 
 $(VENV)/.installed-core: $(PINS) | $(VENV)/bin/pip
 	$(PY) -m pip install $(PIPFLAGS) -c constraints.txt -e .
