@@ -1,0 +1,1 @@
+"""What a person does with it: the command line, the study, verification, reports and pictures."""

@@ -1,0 +1,134 @@
+"""What is here: ``olympics-opt list`` and ``olympics-opt leaderboard``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from olympics_opt.cli import Leaderboard, List
+
+
+def catalogue() -> dict[str, list[dict[str, Any]]]:
+    """Tasks, problems, pretrained policies and demonstrations, as plain JSON values."""
+    return {
+        "tasks": _tasks(),
+        "problems": _problems(),
+        "pretrained": _pretrained(),
+        "demonstrations": _demonstrations(),
+    }
+
+
+def run_list(config: List) -> int:
+    """Prints the catalogue as tables or as JSON."""
+    found = catalogue()
+    if config.json:
+        print(json.dumps(found, indent=2))
+        return 0
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    for title, rows in found.items():
+        if not rows:
+            console.print(f"[bold]{title}[/bold]: none\n")
+            continue
+        table = Table(title=title, title_justify="left", title_style="bold", box=None)
+        for name in rows[0]:
+            table.add_column(name, overflow="fold")
+        for row in rows:
+            table.add_row(*(_cell(value) for value in row.values()))
+        console.print(table)
+        console.print()
+    return 0
+
+
+def run_leaderboard(config: Leaderboard) -> int:
+    """Rebuilds the tables of results and names the files it wrote."""
+    from olympics_opt.leaderboard import rebuild
+
+    for path in rebuild(config.results, config.readme):
+        print(f"wrote {path}")
+    return 0
+
+
+def _tasks() -> list[dict[str, Any]]:
+    import dataclasses
+
+    from sports.env import make_env
+    from sports.registry import get_task, task_names
+
+    rows = []
+    for name in task_names():
+        task = get_task(name)
+        env = make_env(name, num_worlds=1)
+        rows.append(
+            {
+                "name": name,
+                "body": task.body,
+                "agents": env.num_agents,
+                "obs": env.obs_size,
+                "act": env.action_size,
+                "metrics": dict(task.metrics),
+                "options": [f.name for f in dataclasses.fields(task.config)],
+                "summary": task.summary,
+            }
+        )
+        env.close()
+    return rows
+
+
+def _problems() -> list[dict[str, Any]]:
+    from warmstart.problems import PROBLEMS
+
+    return [
+        {
+            "name": p.name,
+            "outcome": p.outcome,
+            "unit": p.unit,
+            "sweep": list(p.sweep),
+            "summary": p.summary,
+        }
+        for p in PROBLEMS.values()
+    ]
+
+
+def _pretrained() -> list[dict[str, Any]]:
+    from rl import pretrained
+
+    return pretrained.available()
+
+
+def _demonstrations() -> list[dict[str, Any]]:
+    """Clips that come with the package, with what they were asked for and what they achieved."""
+    from importlib import resources
+
+    from warmstart.clip import Clip
+
+    folder = Path(str(resources.files("warmstart"))) / "data"
+    rows = []
+    for path in sorted(folder.rglob("*.npz")):
+        clip = Clip.load(path)
+        rows.append(
+            {
+                "name": path.stem,
+                "problem": clip.meta.get("problem"),
+                "strength": clip.meta.get("strength"),
+                "asked": clip.meta.get("asked"),
+                "achieved": clip.meta.get("achieved"),
+                "seconds": round(clip.duration, 2),
+                "path": str(path),
+            }
+        )
+    return rows
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(
+            f"{k} {v:.4g}" if isinstance(v, float) else f"{k} ({v})" for k, v in value.items()
+        )
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or "–"
+    return str(value)

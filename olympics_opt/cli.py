@@ -1,0 +1,343 @@
+"""The command line: ``olympics-opt COMMAND``. Light to import; a command loads what it needs.
+
+Exit codes: 0 done, 1 the thing was checked and did not pass (``verify``), 2 a mistake of the
+user, told in one sentence, 130 stopped with Ctrl-C. ``--debug`` shows the traceback of a mistake.
+
+Options of a problem or task (``--problem.bar-height 1.2``, ``--task.bar-height 1.5``) are the
+fields of its config; ``olympics-opt solve high_jump --help`` lists them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import importlib
+import re
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+Name = Annotated[str, arg(metavar="NAME")]
+
+
+class UsageError(ValueError):
+    """A command line that cannot be understood."""
+
+
+@dataclass(frozen=True)
+class List:
+    """Tasks, optimisation problems, trained policies and demonstrations that are here."""
+
+    json: bool = False
+    """Print JSON instead of tables."""
+
+
+@dataclass(frozen=True)
+class Solve:
+    """Optimise a motion, certify it and track it in MuJoCo.
+
+    Writes demo.npz (the motion), certificate.json and preview.html. An infeasible problem ends
+    with the name of the constraint that stopped it.
+    """
+
+    name: Positional[Annotated[str, arg(metavar="PROBLEM")]]
+    """Optimisation problem; see ``olympics-opt list``."""
+    out: Path
+    """Folder for the results."""
+    sweep: str | None = None
+    """Solve for several values of one option, in parallel: ``bar-height=0.8:1.5:8`` (first,
+    last, count)."""
+    processes: int = 2
+    """Worker processes of a sweep."""
+    track: bool = True
+    """Follow the motion in MuJoCo with feedback, which makes it a demonstration to learn from."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Play episodes with a policy and write their metrics with 95 % intervals."""
+
+    name: Positional[Annotated[str, arg(metavar="TASK")]]
+    """Sport; see ``olympics-opt list``."""
+    policy: str
+    """A run folder, a policy file, or ``pretrained[:ALGO[-STRENGTH]]``."""
+    out: Path
+    """JSON file for the result."""
+    engine: Literal["mujoco", "warp", "drake"] = "mujoco"
+    """Physics engine; ``warp`` needs a GPU."""
+    trials: int = 200
+    """Episodes to play."""
+    seed: int = 0
+    """Seed of all randomness."""
+    worlds: int | None = None
+    """Worlds simulated at a time; by default as many as suit the engine."""
+    processes: int = 2
+    """Worker processes for the ``drake`` engine."""
+    strength: Literal["paper", "human"] | None = None
+    """Strength of the athlete; by default the one the policy was trained with."""
+    limits: Literal["paper", "anatomical"] | None = None
+    """Joint ranges; by default those the policy was trained with."""
+
+
+@dataclass(frozen=True)
+class Verify:
+    """Does a result hold in another engine? Compare MuJoCo with Drake and with half the step.
+
+    Prints the parity table of the two models first, then plays the same policy in each and
+    compares outcomes. Writes report.json and report.html; exit code 1 when the result does not
+    hold.
+    """
+
+    name: Positional[Annotated[str, arg(metavar="TASK")]]
+    """Sport; see ``olympics-opt list``."""
+    policy: str
+    """A run folder, a policy file, or ``pretrained[:ALGO[-STRENGTH]]``."""
+    out: Path
+    """Folder for the report."""
+    trials: int = 100
+    """Episodes on each engine."""
+    seed: int = 0
+    """Seed of all randomness."""
+    processes: int = 2
+    """Worker processes for Drake."""
+    strength: Literal["paper", "human"] | None = None
+    """Strength of the athlete; by default the one the policy was trained with."""
+    limits: Literal["paper", "anatomical"] | None = None
+    """Joint ranges; by default those the policy was trained with."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """The whole line on one sport, from optimisation to a verified policy and a report.
+
+    Stopped at any moment, the same command continues with the stage it was in.
+    """
+
+    name: Positional[Annotated[str, arg(metavar="SPORT")]]
+    """Sport with an optimisation problem and a trained policy; see ``olympics-opt list``."""
+    out: Path
+    """Folder for all stages and report.html."""
+    minutes: float = 4.0
+    """Training time on this machine."""
+    worlds: int = 64
+    """Worlds simulated at a time while training."""
+    trials: int = 100
+    """Episodes of each policy in MuJoCo."""
+    drake_trials: int = 20
+    """Episodes in Drake."""
+    seed: int = 0
+    """Seed of all randomness."""
+    processes: int = 2
+    """Worker processes."""
+
+
+@dataclass(frozen=True)
+class Leaderboard:
+    """Rebuild results/README.md and the results of README.md from results/*.json."""
+
+    results: Path = Path("results")
+    """Folder of the JSON files that ``evaluate`` wrote."""
+    readme: Path = Path("README.md")
+    """Page whose part between the marks ``<!-- results -->`` and ``<!-- /results -->`` is set."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: its options, and ``module:function`` that does it."""
+
+    config: type | None
+    """Config dataclass; None for a command that parses its own options."""
+    does: str
+    options: Literal["problem", "task", ""] = ""
+    """Prefix of the options of the named problem or task."""
+    summary: str = ""
+
+    def help(self) -> str:
+        """One line for the overview."""
+        return self.summary or (self.config.__doc__ or "").strip().splitlines()[0]
+
+
+COMMANDS: dict[str, Command] = {
+    "list": Command(List, "olympics_opt.catalogue:run_list"),
+    "solve": Command(Solve, "olympics_opt.solve:run_solve", "problem"),
+    "train": Command(None, "rl.train:main", summary="Train a policy (PPO), on the CPU or on GPUs."),
+    "evaluate": Command(Evaluate, "olympics_opt.play:run_evaluate", "task"),
+    "verify": Command(Verify, "olympics_opt.verify:run_verify", "task"),
+    "render": Command(
+        None, "olympics_opt.render:main", summary="Video, or a sheet of 12 frames, of a policy."
+    ),
+    "study": Command(Study, "olympics_opt.study:run_study"),
+    "bench": Command(
+        None, "olympics_opt.bench:main", summary="Measure physics, environment and training speed."
+    ),
+    "leaderboard": Command(Leaderboard, "olympics_opt.catalogue:run_leaderboard"),
+}
+LATER = ("mocap", "play")
+"""Commands of later versions: not listed, refused with a sentence."""
+USER_ERRORS = (ValueError, RuntimeError, OSError, ImportError)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command line; returns the exit code."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in args
+    args = [a for a in args if a != "--debug"]
+    name = args[0] if args else ""
+    try:
+        if name in ("", "-h", "--help"):
+            print(overview())
+            return 0 if args else 2
+        if name == "--version":
+            from importlib.metadata import version
+
+            print(f"olympics-opt {version('olympics-opt')}")
+            return 0
+        return run(name, args[1:])
+    except SystemExit as stop:  # tyro and argparse have printed what is wrong
+        if stop.code is None or isinstance(stop.code, int):
+            return stop.code or 0
+        print(f"olympics-opt: {stop.code}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\nolympics-opt: stopped.", file=sys.stderr)
+        return 130
+    except USER_ERRORS as error:
+        if debug:
+            raise
+        print(f"olympics-opt {name}: {sentence(error)}".replace("  ", " "), file=sys.stderr)
+        return 2
+
+
+def run(name: str, args: list[str]) -> int:
+    """Runs the command ``name`` with its arguments. Raises what a user's mistake raises."""
+    if name not in COMMANDS:
+        known = ", ".join(COMMANDS)
+        if name in LATER:
+            raise UsageError(f"this version has no command '{name}'; it has: {known}")
+        raise UsageError(f"unknown command '{name}'; the commands are: {known}")
+    command = COMMANDS[name]
+    if command.config is None:
+        return int(_load(command.does)(args) or 0)
+    config = parse(name, command, args)
+    return int(_load(command.does)(config) or 0)
+
+
+def parse(name: str, command: Command, args: list[str]) -> Any:
+    """The config of a command line; options of its problem or task are in ``config.options``.
+
+    Raises UsageError for an unknown problem, task or option of it; exits through tyro (code 2)
+    for anything else that is wrong.
+    """
+    assert command.config is not None
+    config_type: Any = command.config
+    if command.options:
+        word = command.options
+        chosen = _positional(config_type, args)
+        options = _option_type(word, chosen) if chosen is not None else None
+        if options is not None:
+            _check_options(word, str(chosen), options, args)
+            config_type = dataclasses.make_dataclass(
+                config_type.__name__,
+                [(word, options, dataclasses.field(default_factory=options))],
+                bases=(config_type,),
+                frozen=True,
+            )
+            config_type.__doc__ = command.config.__doc__
+    return tyro.cli(config_type, args=args, prog=f"olympics-opt {name}")
+
+
+def chosen_options(config: Any, word: str) -> dict[str, Any]:
+    """The options of the problem or task that differ from their defaults, by field name."""
+    options = getattr(config, word)
+    default = type(options)()
+    return {
+        f.name: getattr(options, f.name)
+        for f in dataclasses.fields(options)
+        if getattr(options, f.name) != getattr(default, f.name)
+    }
+
+
+def overview() -> str:
+    """The help text of ``olympics-opt`` itself."""
+    width = max(map(len, COMMANDS)) + 2
+    lines = [
+        "olympics-opt COMMAND [options]",
+        "",
+        "Drake finds a motion, MuJoCo learns to do it a thousand ways at once, Drake checks that",
+        "it is true.",
+        "",
+        "commands:",
+        *(f"  {name:<{width}}{command.help()}" for name, command in COMMANDS.items()),
+        "",
+        "olympics-opt COMMAND --help lists its options; --debug shows the traceback of an error.",
+    ]
+    return "\n".join(lines)
+
+
+def sentence(error: BaseException) -> str:
+    """An exception as one sentence for the person at the keyboard."""
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        where = f" while writing {error.filename}" if error.filename else ""
+        return f"the disk is full{where}; free some space and run the same command again"
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror}: {error.filename}" if error.filename else error.strerror
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        return f"the package '{error.name}' is not installed here"
+    text = re.sub(r"\s+", " ", str(error)).strip()
+    return text or type(error).__name__
+
+
+def _load(place: str) -> Callable[..., int | None]:
+    module, function = place.split(":")
+    return getattr(importlib.import_module(module), function)
+
+
+def _positional(config_type: type, args: Sequence[str]) -> str | None:
+    """The NAME of a command line: the first word that is neither an option nor its value."""
+    flags = {f.name for f in dataclasses.fields(config_type) if f.type in ("bool", bool)}
+    flags |= {f"no-{name}" for name in flags} | {"help", "h"}
+    skip = False
+    for word in args:
+        if skip:
+            skip = False
+        elif word.startswith("-") and len(word) > 1:
+            plain = word.lstrip("-")
+            skip = "=" not in word and plain not in flags and not _is_switch(plain)
+        else:
+            return word
+    return None
+
+
+def _is_switch(option: str) -> bool:
+    """Whether a prefixed option is a switch without a value, whatever its config."""
+    return ".no-" in option
+
+
+def _option_type(word: str, name: str) -> type:
+    """The config dataclass of a problem or task. Raises ValueError listing the known ones."""
+    if word == "problem":
+        from warmstart.problems import get_problem
+
+        return get_problem(name).config
+    from sports.registry import get_task
+
+    return get_task(name).config
+
+
+def _check_options(word: str, name: str, options: type, args: Sequence[str]) -> None:
+    """Raises UsageError for ``--WORD.option`` that the config does not have."""
+    fields = [f.name.replace("_", "-") for f in dataclasses.fields(options)]
+    known = [f"--{word}.{f}" for f in fields]
+    for text in args:
+        if not text.startswith(f"--{word}."):
+            continue
+        option = text.split("=")[0].replace("_", "-")
+        plain = option.replace(f"--{word}.no-", f"--{word}.")
+        if option not in known and plain not in known:
+            have = f"it has: {', '.join(known)}" if known else "it has none"
+            raise UsageError(f"{word} '{name}' has no option {option}; {have}")

@@ -1,0 +1,38 @@
+"""The one progress display: a spinner, a bar, the time, and a word about where the work is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class Bar:
+    """One line of the display."""
+
+    def __init__(self, display, description: str) -> None:
+        self._display = display
+        self._task = display.add_task(description, total=None, detail="")
+
+    def show(self, detail: str, done: float | None = None, total: float | None = None) -> None:
+        """Sets the words at the end, and how much of the work is done where that is known."""
+        self._display.update(self._task, detail=detail, completed=done, total=total)
+
+    def finish(self, detail: str) -> None:
+        """Ends the line with what came out."""
+        self._display.update(self._task, detail=detail, completed=1, total=1)
+
+
+@contextmanager
+def progress(description: str) -> Iterator[Bar]:
+    """Shows a line while the body runs; without a terminal only its final state is printed."""
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (
+        SpinnerColumn(finished_text=" "),
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=20),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[detail]}"),
+    )
+    with Progress(*columns, refresh_per_second=4) as display:
+        yield Bar(display, description)

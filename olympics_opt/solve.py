@@ -1,0 +1,261 @@
+"""``olympics-opt solve``: a motion from nothing, its certificate, and a page to look at it.
+
+The order is the argument: optimise, prove by other code that the motion is possible, then follow
+it in MuJoCo with feedback. Only what passed is written as a demonstration.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from olympics_opt import atomic
+from olympics_opt.progress import progress
+
+if TYPE_CHECKING:
+    from olympics_opt.cli import Solve
+    from olympics_opt.report.page import Plots, Section, Tiles
+    from warmstart.certificate import Certificate
+    from warmstart.solution import Solution
+    from warmstart.tracking import Tracked
+
+SOLUTION, DEMO, CERTIFICATE, PREVIEW = (
+    "solution.npz",
+    "demo.npz",
+    "certificate.json",
+    "preview.html",
+)
+
+
+def run_solve(config: Solve) -> int:
+    """The command: 0 with a demonstration, 1 when the certificate refuses the motion.
+
+    Raises ValueError for an unknown problem or option, ``Infeasible`` naming the constraint that
+    stopped the optimiser.
+    """
+    from olympics_opt.cli import chosen_options
+
+    problem_config = config.problem  # type: ignore[attr-defined]  # added by the command line
+    if config.sweep is not None:
+        return _run_sweep(config, chosen_options(config, "problem"))
+    solution = optimise(config.name, problem_config, config.out)
+    certificate = certify_solution(solution, config.out)
+    tracked = None
+    if certificate.passed and config.track:
+        tracked = track_clip(solution, config.out)
+    elif certificate.passed:
+        from warmstart.clip import clip_from_solution
+
+        clip_from_solution(solution).save(config.out / DEMO)
+    write_preview(solution, certificate, tracked, config.out / PREVIEW)
+    _print_outcome(solution, certificate, tracked, config.out)
+    return 0 if certificate.passed else 1
+
+
+def optimise(problem: str, problem_config: Any, out: Path) -> Solution:
+    """Solves a problem with a progress display and writes solution.npz."""
+    from warmstart.problems import get_problem
+
+    entry = get_problem(problem)
+    asked = getattr(problem_config, entry.outcome)
+    with progress(f"optimising {problem}, {entry.outcome} {asked:g} {entry.unit}") as bar:
+        solution = entry.solve(
+            problem_config,
+            progress=lambda i, effort: bar.show(f"iteration {i}, effort {effort:.4g}"),
+        )
+        bar.finish(f"solved in {solution.stats.get('solve_s', 0):.0f} s")
+    solution.save(out / SOLUTION)
+    return solution
+
+
+def certify_solution(solution: Solution, out: Path) -> Certificate:
+    """Checks a solution and writes certificate.json; the caller asks whether it passed."""
+    from warmstart.certificate import certify
+
+    with progress("certifying in Drake and MuJoCo") as bar:
+        certificate = certify(solution)
+        facts = certificate_json(certificate)
+        passed = sum(bool(c["passed"]) for c in facts["checks"])
+        bar.finish(f"{passed} of {len(facts['checks'])} checks passed")
+    atomic.write_json(out / CERTIFICATE, facts)
+    return certificate
+
+
+def certificate_json(certificate: Certificate) -> dict[str, Any]:
+    """A certificate as plain JSON values."""
+    value = certificate.to_json()
+    return json.loads(value) if isinstance(value, str) else value
+
+
+def track_clip(solution: Solution, out: Path, seed: int = 0) -> Tracked:
+    """Follows a certified solution in MuJoCo with feedback and writes demo.npz."""
+    from warmstart.tracking import Tracking, track
+
+    with progress("tracking in MuJoCo") as bar:
+        tracked = track(
+            solution,
+            settings=Tracking(seed=seed),
+            progress=lambda i, n: bar.show(f"step {i} of {n}", i, n),
+        )
+        bar.finish(f"links {100 * tracked.link_error:.1f} cm off")
+    tracked.clip.save(out / DEMO)
+    return tracked
+
+
+def write_preview(
+    solution: Solution, certificate: Certificate, tracked: Tracked | None, path: Path
+) -> Path:
+    """The page of one optimised motion: asked, achieved, checks, plots, replay, provenance."""
+    from olympics_opt.report import sections
+    from olympics_opt.report.page import Page, Section, write_page
+    from rl import provenance
+
+    facts = certificate_json(certificate)
+    blocks = [
+        sections.asked_achieved_tiles(
+            solution.asked, facts.get("achieved") or {}, "replayed by the certificate"
+        ),
+        *([tracking_tiles(tracked)] if tracked is not None else []),
+        solution_plots(solution),
+    ]
+    page = Page(
+        f"{solution.problem.replace('_', ' ').capitalize()}: an optimised motion",
+        [
+            Section("Asked and achieved", blocks),
+            motion_replay(solution, tracked),
+            sections.certificate_section(facts),
+            sections.provenance_section(
+                {
+                    "problem": solution.problem,
+                    "asked": solution.asked,
+                    "strength": solution.strength,
+                    "solver": solution.stats,
+                    "commit": provenance.commit(),
+                    "hardware": provenance.hardware(),
+                    "versions": provenance.versions(),
+                }
+            ),
+        ],
+        "The least-effort motion with the prescribed outcome, found by trajectory optimisation on "
+        "full inverse dynamics.",
+    )
+    return write_page(page, path)
+
+
+def tracking_tiles(tracked: Tracked) -> Tiles:
+    """What MuJoCo made of the motion."""
+    from olympics_opt.report.page import Tile, Tiles, number
+
+    achieved = tracked.clip.meta.get("achieved", {})
+    success = achieved.get("success")
+    tiles = [
+        Tile(
+            "tracked in MuJoCo",
+            {None: "no task", True: "success", False: "failed"}[
+                None if success is None else success > 0.5
+            ],
+            "by the rules of the sport",
+            "" if success is None else "good" if success > 0.5 else "bad",
+        ),
+        Tile("link error", f"{100 * tracked.link_error:.1f} cm", "root mean square"),
+    ]
+    skip = ("success", "foul", "knocked", "bar_height")
+    tiles += [
+        Tile(f"tracked: {name.replace('_', ' ')}", number(float(value)))
+        for name, value in achieved.items()
+        if name not in skip and not name.startswith(("success_", "height_"))
+    ]
+    return Tiles(tiles)
+
+
+def solution_plots(solution: Solution) -> Plots:
+    """Height, speed, ground force and effort of an optimised motion over time."""
+    from olympics_opt.report.page import Plots
+    from olympics_opt.report.plots import Plot, Series
+    from olympics_opt.report.sections import GRAVITY, body_plots
+
+    time = solution.times - solution.times[0]
+    weight = solution.body.mass * GRAVITY
+    force = np.linalg.norm(solution.contact_force.sum(axis=1), axis=-1) / weight
+    share = np.abs(solution.torque) / solution.body.array("effort")
+    legs = [i for i, dof in enumerate(solution.body.dofs) if dof.link[2:] in _LEG]
+    rest = [i for i in range(solution.body.num_dofs) if i not in legs]
+    return Plots(
+        [
+            *body_plots(time, solution.qpos, solution.qvel).plots,
+            Plot(
+                "Ground force",
+                "time (s)",
+                "body weights",
+                [Series("force", time, force)],
+                levels={"standing": 1.0},
+            ),
+            Plot(
+                "Largest torque, share of the limit",
+                "time (s)",
+                "1",
+                [
+                    Series("legs", time, share[:, legs].max(axis=1)),
+                    Series("trunk and arms", time, share[:, rest].max(axis=1)),
+                ],
+                levels={"limit": 1.0},
+            ),
+        ]
+    )
+
+
+_LEG = ("Hip", "Knee", "Ankle", "Toe")
+
+
+def motion_replay(solution: Solution, tracked: Tracked | None) -> Section:
+    """The 3-D replay of an optimised and of a tracked motion."""
+    from olympics_opt.report.page import Fragment, Section
+    from olympics_opt.report.replay import ReplayTrack, replay_html
+    from warmstart.clip import clip_from_solution
+    from warmstart.tracking import scene_of
+
+    clip = clip_from_solution(solution, 60.0)
+    tracks = [ReplayTrack.from_clip(clip, "optimised")]
+    if tracked is not None:
+        tracks.append(ReplayTrack.from_clip(tracked.clip, "tracked in MuJoCo"))
+    title = f"{solution.problem.replace('_', ' ')}, optimised motion"
+    fragment = replay_html(scene_of(clip), tracks, title=title, element_id="replay-solution")
+    return Section("Replay", [Fragment(fragment)])
+
+
+def _print_outcome(
+    solution: Solution, certificate: Certificate, tracked: Tracked | None, out: Path
+) -> None:
+    from olympics_opt.report.page import number
+
+    facts = certificate_json(certificate)
+    for check in facts["checks"]:
+        mark = "passed" if check["passed"] else "FAILED"
+        unit = check.get("unit", "")
+        print(
+            f"  {mark}  {check['name']:<44} {number(check['value']):>10} {unit} "
+            f"(limit {number(check['limit'])})"
+        )
+    asked = ", ".join(f"{k} {number(v)}" for k, v in solution.asked.items())
+    achieved = ", ".join(
+        f"{k} {number(v)}" for k, v in (facts.get("achieved") or {}).items() if np.isscalar(v)
+    )
+    print(f"asked {asked}; achieved {achieved or 'nothing'}")
+    if tracked is not None:
+        print(
+            f"tracked in MuJoCo: links {100 * tracked.link_error:.1f} cm off, "
+            + ", ".join(
+                f"{k} {number(float(v))}" for k, v in tracked.clip.meta.get("achieved", {}).items()
+            )
+        )
+    if certificate.passed:
+        print(f"wrote {out / DEMO}, {out / CERTIFICATE} and {out / PREVIEW}")
+    else:
+        print(f"not certified: no demonstration is written; see {out / PREVIEW}")
+
+
+def _run_sweep(config: Solve, options: dict[str, Any]) -> int:
+    raise NotImplementedError

@@ -1,0 +1,133 @@
+"""The command line: help for everything it lists, and one sentence for every mistake."""
+
+from __future__ import annotations
+
+import errno
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from olympics_opt import cli
+from sports.registry import task_names
+
+HEAVY = ("pydrake", "casadi", "torch", "mujoco", "warp", "matplotlib", "OpenGL", "scipy")
+
+
+def sentence_of(capsys, *args: str) -> str:
+    """Runs a mistaken command line; returns its one sentence."""
+    assert cli.main(args) == 2
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    return err
+
+
+def test_importing_the_command_line_is_light():
+    code = f"import sys, olympics_opt.cli; print([m for m in {HEAVY!r} if m in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_overview_lists_what_exists_and_nothing_else(capsys):
+    assert cli.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    for name in cli.COMMANDS:
+        assert f"\n  {name} " in text
+    for name in cli.LATER:
+        assert f"\n  {name} " not in text
+        assert f"no command '{name}'" in sentence_of(capsys, name)
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_has_help(name: str, capsys):
+    assert cli.main([name, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert f"olympics-opt {name}" in out
+    assert "--" in out
+
+
+def test_help_of_a_task_lists_its_options(capsys):
+    assert cli.main(["evaluate", "high_jump", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "--task.bar-height" in text and "Height of the bar's top" in text
+
+
+def test_options_of_a_task_reach_its_config():
+    args = "--task.no-curriculum --policy=x high_jump --out y --task.bar_height=1.2".split()
+    config = cli.parse("evaluate", cli.COMMANDS["evaluate"], args)
+    assert config.name == "high_jump"
+    assert cli.chosen_options(config, "task") == {"bar_height": 1.2, "curriculum": False}
+    plain = cli.parse("evaluate", cli.COMMANDS["evaluate"], ["long_jump", "--policy", "x", "--out", "y"])
+    assert cli.chosen_options(plain, "task") == {}
+
+
+@pytest.mark.parametrize(
+    "line, words",
+    [
+        ("fly", "unknown command 'fly'"),
+        ("evaluate hi_jump --policy zero --out x.json", "unknown task 'hi_jump'"),
+        ("evaluate hi_jump --policy zero --out x.json", "high_jump"),
+        ("evaluate high_jump --policy zero --out x.json --task.bar 1", "--task.bar-height"),
+        ("evaluate high_jump --policy zero --out x.json --task.bar-height 99", "bar_height"),
+        ("evaluate high_jump --policy nowhere --out x.json", "no policy 'nowhere'"),
+        ("evaluate high_jump --policy zero --out x.json --trials 0", "trials"),
+        ("verify high_jump --policy pretrained:xyz --out x", "pretrained policy 'xyz'"),
+        ("solve pole_vault --out x", "unknown problem 'pole_vault'"),
+        ("solve high_jump --out x --problem.bar 1", "--problem.bar-height"),
+        ("solve high_jump --out x --problem.bar-height 9", "bar_height"),
+        ("study tennis --out x", "tennis"),
+        ("leaderboard --results nowhere", "nowhere"),
+    ],
+)
+def test_a_mistake_is_told_in_a_sentence(line: str, words: str, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = sentence_of(capsys, *line.split())
+    assert words in text, text
+    assert list(tmp_path.iterdir()) == []  # and nothing is written
+
+
+@pytest.mark.parametrize(
+    "line", ["evaluate", "evaluate high_jump", "evaluate high_jump --policy x --out y --trials ten"]
+)
+def test_an_incomplete_line_exits_2(line: str, capsys):
+    assert cli.main(line.split()) == 2
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err and (out + err).strip()
+
+
+def test_a_full_disk_is_named_as_such():
+    error = OSError(errno.ENOSPC, "No space left on device", "/data/run/file.json")
+    assert "disk is full while writing /data/run/file.json" in cli.sentence(error)
+
+
+def test_debug_shows_where(monkeypatch):
+    with pytest.raises(ValueError, match="unknown command"):
+        cli.main(["fly", "--debug"])
+
+
+def test_no_engine_is_a_sentence(capsys, tmp_path, monkeypatch):
+    def no_gpu(*args, **kwargs):
+        raise RuntimeError("engine 'warp' needs a GPU, and this machine has none")
+
+    monkeypatch.setattr(cli, "_load", lambda place: no_gpu)
+    text = sentence_of(
+        capsys, "evaluate", "high_jump", "--policy", "zero", "--out", str(tmp_path / "x.json")
+    )
+    assert "needs a GPU" in text
+
+
+def test_list_as_json(capsys):
+    assert cli.main(["list", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [t["name"] for t in found["tasks"]] == list(task_names())
+    jump = found["tasks"][0]
+    assert (jump["body"], jump["agents"], jump["act"]) == ("smpl", 1, 69)
+    assert jump["obs"] == 358 + 6  # sports page: proprioception and goal features
+    assert jump["metrics"]["height"] == "m"
+    assert {p["name"] for p in found["problems"]} == {"high_jump", "long_jump"}
+    for policy in found["pretrained"]:
+        assert Path(policy["path"]).is_file()

@@ -1,0 +1,100 @@
+"""Tables of results: every figure comes from a file, and a broken file is named."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from olympics_opt import leaderboard
+
+
+def result(**changes) -> dict:
+    return {
+        "task": "high_jump",
+        "algo": "ppo",
+        "policy_sha256": "ab" * 32,
+        "engine": "mujoco",
+        "strength": "paper",
+        "limits": "paper",
+        "trials": 1000,
+        "seed": 0,
+        "commit": "0123456789abcdef",
+        "versions": {},
+        "hardware": "a machine",
+        "metrics": {
+            "success_1.0m": {"mean": 0.875, "ci95": [0.853, 0.894], "n": 1000, "unit": "fraction"},
+            "height_1.0m": {"mean": 1.625, "ci95": [1.5, 1.75], "n": 875, "unit": "m"},
+        },
+        "overflow": 0,
+        "nan_worlds": 0,
+        **changes,
+    }
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "a.json").write_text(json.dumps(result(engine="drake", trials=100)))
+    (tmp_path / "b.json").write_text(json.dumps(result()))
+    (tmp_path / "bench.json").write_text(json.dumps({"steps_per_s": 1}))
+    return tmp_path
+
+
+def test_the_page_has_our_figures_and_the_papers(folder: Path):
+    page = leaderboard.results_page(leaderboard.read_results(folder))
+    rows = [line for line in page.splitlines() if line.startswith("| ppo")]
+    assert ["mujoco" in rows[0], "drake" in rows[1]] == [True, True]
+    assert "87.5 [85.3, 89.4] %" in page
+    paper = next(line for line in page.splitlines() if line.startswith("| PPO, paper"))
+    assert "100 %" in paper and "4.08 m" in paper  # sports page: 100 % / 4.08 at 1 m
+    assert all(line.count(" | ") == rows[0].count(" | ") for line in (paper, rows[1]))
+
+
+def test_the_front_page_keeps_its_text(folder: Path):
+    front = folder / "front.md"
+    text = f"# Title\n\n{leaderboard.BEGIN}\nold\n{leaderboard.END}\n\nThe end.\n"
+    front.write_text(text)
+    leaderboard.rebuild(folder, front)
+    once = front.read_text()
+    assert once.startswith("# Title\n") and once.endswith("\nThe end.\n") and "old" not in once
+    leaderboard.rebuild(folder, front)
+    assert front.read_text() == once
+
+
+def test_a_front_page_without_marks_changes_nothing(folder: Path):
+    front = folder / "front.md"
+    front.write_text("# Title\n")
+    with pytest.raises(ValueError, match="marks"):
+        leaderboard.rebuild(folder, front)
+    assert front.read_text() == "# Title\n" and not (folder / "README.md").exists()
+
+
+@pytest.mark.parametrize("text", ['{"task": ', '{"task": "x", "metrics": {}}'])
+def test_a_broken_result_is_named(folder: Path, text: str):
+    (folder / "broken.json").write_text(text)
+    with pytest.raises(ValueError, match=r"broken\.json"):
+        leaderboard.read_results(folder)
+
+
+def test_the_papers_table_is_whole():
+    paper = leaderboard.paper_results()
+    assert paper["long_jump"]["success"]["PPO"] == pytest.approx(0.536)
+    assert paper["table_tennis"]["error"]["PULSE + AMP"] == pytest.approx(0.23)
+    for task, metrics in paper.items():
+        for name, row in metrics.items():
+            values = [row[a] for a in leaderboard.PAPER_COLUMNS if row[a] is not None]
+            assert values, (task, name)
+            assert row["unit"] != "fraction" or all(0 <= v <= 1 for v in values), (task, name)
+
+
+def test_our_metrics_have_the_papers_names():
+    """The comparison is by name: a renamed metric would drop out of the table in silence."""
+    from sports.registry import get_task, task_names
+
+    paper = leaderboard.paper_results()
+    for task in set(task_names()) & set(paper):
+        units = get_task(task).metrics
+        for name, row in paper[task].items():
+            assert re.fullmatch(re.escape(row["unit"]), units[name]), (task, name)
