@@ -266,6 +266,15 @@ def newton_euler(
     return ca.vertcat(motion.R_WL[0] @ f[0], n[0], *tau)
 
 
+def center_of_mass(tree: Tree, motion: Motion):
+    """World position and velocity of the centre of mass (3x1 each; m, m/s)."""
+    p, v = ca.SX(3, 1), ca.SX(3, 1)
+    for i, mass in enumerate(tree.mass / tree.total_mass):
+        p += mass * motion.point(i, tree.com[i])
+        v += mass * motion.point_velocity(i, tree.com[i])
+    return p, v
+
+
 @dataclass(frozen=True)
 class ReducedModel:
     """A tree whose hinges are free where named and held at a constant pose elsewhere."""

@@ -1,0 +1,80 @@
+"""Optimisation problems by name: each asks for an outcome and minimises effort.
+
+``PROBLEMS[name]`` tells how to configure, solve and sweep a problem without importing CasADi;
+the modules load when they are first used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+from warmstart.solution import Solution
+
+
+class Infeasible(RuntimeError):
+    """No motion was found; the message names the outcome and the limiting constraint."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One entry of the registry."""
+
+    name: str
+    summary: str
+    outcome: str
+    """Config field that prescribes the outcome."""
+    unit: str
+    sweep: tuple[float, ...]
+    """Outcomes for a standard sweep, easiest first, so that each can start from the last."""
+    module: str
+
+    @property
+    def config(self) -> type:
+        """Frozen dataclass of options; every field has a docstring and a default."""
+        return import_module(self.module).Config
+
+    def solve(
+        self,
+        config: Any,
+        guess: Solution | None = None,
+        progress: Callable[[int, float], None] | None = None,
+    ) -> Solution:
+        """Solves one problem, from a neighbour's solution if given.
+
+        ``progress(iteration, objective)`` is called after every iteration. Raises ValueError
+        for an impossible option and :class:`Infeasible` when no motion is found.
+        """
+        return import_module(self.module).solve(config, guess=guess, progress=progress)
+
+
+PROBLEMS: dict[str, Problem] = {
+    problem.name: problem
+    for problem in (
+        Problem(
+            name="high_jump",
+            summary="take-off step, clearance and landing over a bar of given height",
+            outcome="bar_height",
+            unit="m",
+            sweep=(0.8, 1.0, 1.2, 1.5),
+            module="warmstart.problems.high_jump",
+        ),
+        Problem(
+            name="long_jump",
+            summary="take-off step, flight and touch-down at a given length",
+            outcome="length",
+            unit="m",
+            sweep=(3.0, 5.0, 7.0),
+            module="warmstart.problems.long_jump",
+        ),
+    )
+}
+
+
+def get_problem(name: str) -> Problem:
+    """The problem of that name. Raises ValueError listing the known ones."""
+    if name not in PROBLEMS:
+        raise ValueError(f"unknown problem '{name}'; known: {', '.join(PROBLEMS)}")
+    return PROBLEMS[name]

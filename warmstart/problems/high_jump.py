@@ -1,0 +1,173 @@
+"""High jump: one take-off step, a bar of prescribed height, landing on the feet beyond it.
+
+The athlete comes down the line y = 6 (the bar spans y = 4 to 8), takes off from the left foot,
+clears the bar at (20, 6) with every body point and ends as the right foot reaches the ground.
+Effort is minimal. The bar's keep-out region is the parabola z = h - 8 (x - 20)^2: it contains
+the bar (radius 0.025 m) and, unlike a circle, cannot be passed on the wrong side or jumped
+between two knots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from sports.humanoid.body import Strength, load_body
+from warmstart.contact import Ball, outline
+from warmstart.nlp import Result
+from warmstart.problems import jumper
+from warmstart.solution import Solution
+from warmstart.transcription import Bounds, Phase, Transcription
+
+BAR_X, LANE_Y = 20.0, 6.0
+_PARABOLA = 8.0
+"""Curvature (1/m) of the keep-out parabola; up to 1 / (2 radius) = 20 would contain the bar."""
+_COVERED = ("Neck", "Thorax", "Wrist", "Spine")
+"""Links whose balls lie inside the hull of their neighbours."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the high-jump problem."""
+
+    bar_height: float = 1.0
+    """Top of the bar above the ground (m)."""
+    strength: Strength = "human"
+    """Torque limits: ``human`` (with torque-speed lines) or ``paper``."""
+    clearance: float = 0.04
+    """Least distance of the body over the bar at knots (m)."""
+    approach_speed: tuple[float, float] = (2.0, 7.0)
+    """Forward speed of the centre of mass at touch-down of the take-off foot (m/s)."""
+    max_iterations: int = 300
+    """IPOPT iterations before giving up."""
+
+    def __post_init__(self) -> None:
+        if not 0.3 <= self.bar_height <= 2.6:
+            raise ValueError(
+                f"bar_height must lie between 0.3 and 2.6 m, not {self.bar_height}: the world "
+                "record is 2.45 m"
+            )
+        if not 0.0 <= self.clearance <= 0.3:
+            raise ValueError(f"clearance must lie between 0 and 0.3 m, not {self.clearance}")
+        low, high = self.approach_speed
+        if not 0.0 <= low <= high <= 11.0:
+            raise ValueError(
+                f"approach_speed must be a range within 0..11 m/s, not {self.approach_speed}"
+            )
+
+
+def bar_clearance(ball: Ball, p_W, bar_height):
+    """Signed clearance of a ball over the keep-out parabola (a lower bound, m)."""
+    dx = p_W[0] - BAR_X
+    reach = ball.radius * ca.sqrt(1 + (2 * _PARABOLA * dx) ** 2)
+    return p_W[2] - bar_height + _PARABOLA * dx**2 - reach
+
+
+def transcribe(config: Config, elastic: bool = False) -> Transcription:
+    """The nonlinear program; its parameter is the bar's height plus the clearance."""
+    body = load_body("smpl", strength=config.strength)
+    model = jumper.make_model(body)
+    phases = [
+        Phase("flat", 14, (0.09, 0.30), {"L": "flat"}),
+        Phase("toe", 8, (0.04, 0.15), {"L": "toe"}),
+        Phase("flight", 34, (0.30, 1.20)),
+    ]
+    position = jumper.boxes(jumper.POSITION) | {
+        "x": (BAR_X - 5, BAR_X + 3),
+        "y": (LANE_Y - 0.5, LANE_Y + 0.5),
+        "z": (0.5, 3.0),
+    }
+    program = Transcription(
+        body,
+        model,
+        phases,
+        Bounds(position, jumper.boxes(jumper.RATE)),
+        held_limits=jumper.HELD_LIMITS,
+        parameters=1,
+        elastic=elastic,
+    )
+    jumper.start_rows(program, config.approach_speed, sink=(-1.2, -0.1), limb_rate=8.0)
+    flight = program.knots("flight")
+    wide = ("Ankle", "Toe", "Pelvis")
+    balls = [b for b in outline(body) if b.link.endswith(wide)]
+    balls += [b for b in outline(body, sagittal=True) if not b.link.endswith((*wide, *_COVERED))]
+
+    def clear(q, p):
+        motion = model.motion(q)
+        gaps = [
+            bar_clearance(b, motion.point(model.tree.link(b.link), b.center), p[0]) for b in balls
+        ]
+        return [("bar clearance", ca.vertcat(*gaps), 0.0, np.inf)]
+
+    program.rows("bar", flight[1:], clear)
+    left, right = jumper.foot(body, "L"), jumper.foot(body, "R")
+    program.ground(right, np.arange(program.K - 1))
+    program.ground(left, flight[3:])
+
+    def land(q, p):
+        motion = model.motion(q)
+        corners = [motion.point(model.tree.link(b.link), b.center) for b in right]
+        return [
+            ("landing height", ca.vertcat(*[c[2] for c in corners]), 0.0, 0.03),
+            ("landing beyond the bar", ca.vertcat(*[c[0] for c in corners]), BAR_X + 0.2, np.inf),
+            ("root beyond the bar", q[0], BAR_X + 0.3, np.inf),
+            ("root height", q[2], 0.70, 1.2),
+        ]
+
+    program.rows("end", [program.K - 1], land)
+    program.bound(program.q[-1, model.index("pitch")], -0.4, 0.7)
+    return program
+
+
+def first_guess(program: Transcription, bar_height: float) -> np.ndarray:
+    """Key poses of a tucked hurdle-style jump along a ballistic root path."""
+    durations = (0.15, 0.07, 0.65)
+    h = np.array([d / p.intervals for d, p in zip(durations, program.phases, strict=True)])
+    t = np.concatenate([[0.0], np.cumsum(h[program.interval_phase()])])
+    arms = [{"L_Shoulder_z": -s, "R_Shoulder_z": s} for s in (-0.5, 0.0, 0.8, 1.0, 0.5, 0.0)]
+    frames = [
+        jumper.legs((-0.5, 0.4, 0.2, 0), (0.3, 1.2, 0, 0), pitch=-0.1, **arms[0]),
+        jumper.legs((0, 0.3, -0.3, 0), (-0.6, 1.3, 0, 0), **arms[1]),
+        jumper.legs((0.3, 0.1, 0.3, -0.7), (-1.4, 1.5, 0, 0), **arms[2]),
+        jumper.legs((-1, 1.8, 0.3, 0), (-2.0, 1.8, 0, 0), pitch=0.3, Torso_y=0.3, **arms[3]),
+        jumper.legs((-1.9, 2.0, 0.3, 0), (-1.6, 1.2, 0, 0), pitch=0.3, Torso_y=0.3, **arms[4]),
+        jumper.legs((-0.9, 1.2, 0, 0), (-0.5, 0.4, 0, 0), pitch=0.1, **arms[5]),
+    ]
+    q = jumper.key_frames(program.model, [0, 0.15, 0.22, 0.45, 0.65, 0.87], frames, t)
+    speed, off, rise, height = 3.6, 0.22, 2.5 + 1.2 * (bar_height - 1.0), 0.97
+    air = np.clip(t - off, 0.0, None)
+    q[:, 0] = BAR_X - speed * (off + 0.29) + speed * t
+    q[:, 1] = LANE_Y
+    q[:, 2] = np.where(
+        t < off, 0.86 + (height - 0.86) * (t / off) ** 2, height + rise * air - 4.905 * air**2
+    )
+    q[:, 2] = np.maximum(q[:, 2], 0.8)
+    return program.guess(q, durations)
+
+
+def solve(
+    config: Config,
+    guess: Solution | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> Solution:
+    """The least-effort jump over the bar. See :meth:`warmstart.problems.Problem.solve`."""
+
+    def attempt(elastic: bool) -> tuple[Transcription, Result]:
+        program = transcribe(config, elastic)
+        start = (
+            first_guess(program, config.bar_height)
+            if guess is None
+            else program.guess_from(guess)
+        )
+        parameters = [config.bar_height + config.clearance]
+        return program, jumper.run(
+            program, start, parameters, guess is not None, progress, config.max_iterations
+        )
+
+    program, result = attempt(False)
+    what = f"a bar at {config.bar_height:g} m"
+    jumper.check(result, what, lambda: attempt(True))
+    return program.solution("high_jump", {"bar_height": config.bar_height}, result)

@@ -1,0 +1,172 @@
+"""Long jump: one take-off step before the line, flight, heels down at a prescribed length.
+
+The take-off foot stands wholly before the line x = 20. Nothing touches the ground in flight.
+The motion ends as both heels reach the pit at x = 20 + length, legs in front of the body, with
+enough forward speed to be carried over the feet. Effort is minimal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from sports.humanoid.body import Strength, load_body
+from warmstart.contact import outline
+from warmstart.nlp import Result
+from warmstart.problems import jumper
+from warmstart.rigid_body import center_of_mass
+from warmstart.solution import Solution
+from warmstart.transcription import Bounds, Phase, Transcription
+
+LINE_X = 20.0
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the long-jump problem."""
+
+    length: float = 5.0
+    """From the line to the rear-most heel at touch-down (m)."""
+    strength: Strength = "human"
+    """Torque limits: ``human`` (with torque-speed lines) or ``paper``."""
+    board: float = 0.03
+    """Distance of the take-off toe before the line, at least (m)."""
+    approach_speed: tuple[float, float] = (3.0, 9.5)
+    """Forward speed of the centre of mass at touch-down of the take-off foot (m/s)."""
+    max_iterations: int = 300
+    """IPOPT iterations before giving up."""
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.length <= 9.5:
+            raise ValueError(
+                f"length must lie between 1 and 9.5 m, not {self.length}: the world record is "
+                "8.95 m"
+            )
+        if not 0.0 <= self.board <= 0.5:
+            raise ValueError(f"board must lie between 0 and 0.5 m, not {self.board}")
+        low, high = self.approach_speed
+        if not 0.0 <= low <= high <= 11.0:
+            raise ValueError(
+                f"approach_speed must be a range within 0..11 m/s, not {self.approach_speed}"
+            )
+
+
+def transcribe(config: Config, elastic: bool = False) -> Transcription:
+    """The nonlinear program; its parameter is the length."""
+    body = load_body("smpl", strength=config.strength)
+    model = jumper.make_model(body)
+    phases = [
+        Phase("flat", 14, (0.06, 0.25), {"L": "flat"}),
+        Phase("toe", 8, (0.03, 0.12), {"L": "toe"}),
+        Phase("flight", 36, (0.25, 1.20)),
+    ]
+    position = jumper.boxes(jumper.POSITION) | {
+        "x": (LINE_X - 3, LINE_X + 12),
+        "y": (-0.5, 0.5),
+        "z": (0.4, 2.5),
+        "pitch": (-0.7, 1.2),
+    }
+    program = Transcription(
+        body,
+        model,
+        phases,
+        Bounds(position, jumper.boxes(jumper.RATE)),
+        held_limits=jumper.HELD_LIMITS,
+        parameters=1,
+        elastic=elastic,
+    )
+    jumper.start_rows(program, config.approach_speed, sink=(-0.8, -0.1), limb_rate=12.0)
+    left, right = jumper.foot(body, "L"), jumper.foot(body, "R")
+    corners = [b for b in outline(body) if b.link in ("L_Ankle", "L_Toe")]
+
+    def behind_line(q, p):
+        motion = model.motion(q)
+        x = [motion.point(model.tree.link(b.link), b.center)[0] for b in corners]
+        return [("board", ca.vertcat(*x) - LINE_X, -np.inf, -config.board)]
+
+    program.rows("board", [0], behind_line)
+    flight = program.knots("flight")
+    program.ground(right, np.arange(program.K - 1))
+    program.ground(left, flight[3:-1])
+    rest = [
+        b
+        for b in outline(body, sagittal=True)
+        if b.link in ("Pelvis", "L_Hip", "R_Hip", "L_Hand", "R_Hand")
+    ]
+    program.ground(rest, flight[-8:], margin=0.05)
+
+    def land(q, v, p):
+        motion = model.motion(q, v)
+        soles = [
+            motion.point(model.tree.link(b.link), b.center) - ca.vertcat(LINE_X + p[0], 0, 0)
+            for b in left + right
+        ]
+        heels = [
+            s for s, b in zip(soles, left + right, strict=True)
+            if b.link.endswith("Ankle") and b.center[0] < 0
+        ]
+        com, velocity = center_of_mass(model.tree, motion)
+        return [
+            ("soles over the pit", ca.vertcat(*[s[2] for s in soles]), 0.0, np.inf),
+            ("heels down", ca.vertcat(*[h[2] for h in heels]), 0.0, 0.03),
+            ("heels at the length", ca.vertcat(*[h[0] for h in heels]), 0.0, 0.12),
+            ("toes beyond the length", ca.vertcat(*[s[0] for s in soles]), 0.0, np.inf),
+            ("body behind the feet", LINE_X + p[0] - com[0], -0.2, 0.75),
+            ("carried forward", velocity[0], 1.5, np.inf),
+            ("trunk over the legs", com[2], 0.45, 1.3),
+        ]
+
+    program.rows("landing", [program.K - 1], land, rates=True)
+    return program
+
+
+def first_guess(program: Transcription, length: float) -> np.ndarray:
+    """Key poses of a sail-style jump along a ballistic root path."""
+    off, air = 0.16, 0.33 + 0.06 * length
+    durations = (0.10, off - 0.10, air)
+    h = np.array([d / p.intervals for d, p in zip(durations, program.phases, strict=True)])
+    t = np.concatenate([[0.0], np.cumsum(h[program.interval_phase()])])
+    arms = [{"L_Shoulder_z": -s, "R_Shoulder_z": s} for s in (-0.4, 0.0, 0.6, 1.5, 1.0, 0.6)]
+    frames = [
+        jumper.legs((-0.5, 0.35, 0.2, 0), (0.2, 1.4, 0, 0), pitch=-0.05, **arms[0]),
+        jumper.legs((0.1, 0.35, -0.4, 0), (-0.7, 1.5, 0, 0), **arms[1]),
+        jumper.legs((0.45, 0.1, 0.2, -0.7), (-1.3, 1.4, 0, 0), **arms[2]),
+        jumper.legs((-0.2, 1.2, 0.3, 0), (-1.0, 1.0, 0, 0), **arms[3]),
+        jumper.legs((-1.2, 0.8, 0, 0), (-1.2, 0.8, 0, 0), pitch=0.2, Torso_y=0.3, **arms[4]),
+        jumper.legs((-1.4, 0.6, 0, 0), (-1.4, 0.6, 0, 0), pitch=0.3, Torso_y=0.4, **arms[5]),
+    ]
+    times = [0, 0.10, off, off + 0.35 * air, off + 0.75 * air, off + air]
+    q = jumper.key_frames(program.model, times, frames, t)
+    start, land, take_off = 0.95, 0.70, 1.02
+    speed = (length - 0.5 + 0.05) / air
+    rise = (land - take_off + 4.905 * air**2) / air
+    fly = np.clip(t - off, 0.0, None)
+    q[:, 0] = LINE_X - 0.05 + speed * (t - off)
+    q[:, 2] = np.where(
+        t < off, start + (take_off - start) * (t / off) ** 2, take_off + rise * fly - 4.905 * fly**2
+    )
+    return program.guess(q, durations)
+
+
+def solve(
+    config: Config,
+    guess: Solution | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> Solution:
+    """The least-effort jump of a length. See :meth:`warmstart.problems.Problem.solve`."""
+
+    def attempt(elastic: bool) -> tuple[Transcription, Result]:
+        program = transcribe(config, elastic)
+        start = (
+            first_guess(program, config.length) if guess is None else program.guess_from(guess)
+        )
+        return program, jumper.run(
+            program, start, [config.length], guess is not None, progress, config.max_iterations
+        )
+
+    program, result = attempt(False)
+    jumper.check(result, f"a jump of {config.length:g} m", lambda: attempt(True))
+    return program.solution("long_jump", {"length": config.length}, result)
