@@ -1,0 +1,244 @@
+"""Trained policies as files: an actor in fp16 safetensors and a JSON card that says what it is.
+
+``load_policy`` accepts such a file, a run's folder, ``pretrained[:ALGO[-STRENGTH]]``, and the
+baselines ``zero`` and ``random``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as load_safetensors
+from safetensors.torch import save
+from torch import Tensor
+
+from rl import pretrained
+from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint, write_atomically
+from rl.networks import MLP
+
+FORMAT = "olympics-opt policy 1"
+BASELINES = ("zero", "random")
+MAX_WIDTH, MAX_LAYERS = 1 << 16, 32
+_REQUIRED = {
+    "format": str,
+    "task": str,
+    "algo": str,
+    "body": str,
+    "strength": str,
+    "limits": str,
+    "obs_size": int,
+    "action_size": int,
+    "hidden": list,
+    "activation": str,
+    "observation_clip": float,
+    "obs_mean": list,
+    "obs_std": list,
+    "obs_count": float,
+    "sha256": str,
+}
+
+
+class PolicyError(ValueError):
+    """A policy cannot be used here; the message is a sentence with the remedy."""
+
+
+@dataclass
+class Policy:
+    """A deterministic policy: its mean action.
+
+    Call it with raw observations (N, A, obs); returns actions (N, A, act), unclipped.
+    """
+
+    actor: MLP | None
+    """None for a baseline."""
+    mean: Tensor
+    """(obs,) observation statistics."""
+    std: Tensor
+    metadata: dict[str, Any]
+    """The card: task, algo, body, strength, limits, sizes, obs_layout, config, samples, minutes,
+    hardware, metrics, sha256."""
+    extra: dict[str, Tensor] = field(default_factory=dict)
+    """Critic state, where the source has it (a run's folder)."""
+    _random: torch.Generator | None = None
+
+    @torch.no_grad()
+    def __call__(self, obs: Tensor) -> Tensor:
+        """(..., obs) -> (..., act)."""
+        if self.actor is None:
+            shape = (*obs.shape[:-1], self.metadata["action_size"])
+            if self.metadata["algo"] == "zero":
+                return torch.zeros(shape, device=obs.device)
+            if self._random is None or self._random.device != obs.device:
+                self._random = torch.Generator(obs.device).manual_seed(0)
+            return 2.0 * torch.rand(shape, device=obs.device, generator=self._random) - 1.0
+        clip = self.metadata["observation_clip"]
+        return self.actor(((torch.nan_to_num(obs) - self.mean) / self.std).clamp(-clip, clip))
+
+    def to(self, device: torch.device | str) -> Policy:
+        """The same policy on a device (moved in place)."""
+        if self.actor is not None:
+            self.actor.to(device)
+        self.mean, self.std = self.mean.to(device), self.std.to(device)
+        return self
+
+    def check(self, env: Any) -> None:
+        """Raises PolicyError where the policy does not fit an environment."""
+        m = self.metadata
+        if self.actor is None:
+            m["action_size"] = env.action_size
+            return
+        for name, have in (("obs_size", env.obs_size), ("action_size", env.action_size)):
+            if m[name] != have:
+                raise PolicyError(
+                    f"the policy has {name} {m[name]}, but task '{env.task.name}' with these "
+                    f"options has {have}: use a policy trained on it"
+                )
+        layout = {k: [s.start, s.stop] for k, s in env.obs_slices.items()}
+        if m.get("obs_layout") not in (None, layout):
+            raise PolicyError(
+                f"the policy was trained on another layout of the observations of "
+                f"'{env.task.name}': train it again with this version"
+            )
+
+
+def load_policy(source: str | Path, task: str) -> Policy:
+    """A policy for a task.
+
+    Args:
+        source: ``FILE.safetensors`` with ``FILE.json`` beside it, a run's folder (its last
+            checkpoint), ``pretrained``, ``pretrained:ALGO``, ``pretrained:ALGO-STRENGTH``,
+            ``zero`` (PD target zero) or ``random`` (uniform actions).
+        task: the task that it must be trained on.
+
+    Raises PolicyError when it is missing, truncated, altered, not a policy, or another task's.
+    """
+    text = str(source)
+    if text in BASELINES:
+        metadata = {"task": task, "algo": text, "action_size": 0, "sha256": ""}
+        return Policy(None, torch.zeros(0), torch.ones(0), metadata)
+    if text == "pretrained" or text.startswith("pretrained:"):
+        try:
+            path = pretrained.locate(task, text.partition(":")[2] or "ppo")
+        except ValueError as error:
+            raise PolicyError(str(error)) from error
+    else:
+        path = Path(source)
+    if path.is_dir():
+        policy = _from_run(path)
+    elif path.is_file():
+        policy = _from_file(path)
+    else:
+        raise PolicyError(
+            f"there is no policy '{source}': give a run's folder, a .safetensors file, "
+            f"'pretrained' or one of {', '.join(BASELINES)}"
+        )
+    found = policy.metadata["task"]
+    if found != task:
+        raise PolicyError(f"the policy '{source}' is of task '{found}', not of '{task}'")
+    return policy
+
+
+def _from_run(run: Path) -> Policy:
+    saved = checkpoints(run)
+    if not saved:
+        raise PolicyError(f"the run '{run}' has no checkpoint yet: train it for longer")
+    try:
+        state, tensors = load_checkpoint(saved[-1])
+        card = dict(state["card"])
+    except (CheckpointError, KeyError, TypeError, ValueError) as error:
+        raise PolicyError(f"the run '{run}' cannot be used: {error}") from error
+    weights = {k.removeprefix("agent/actor."): v for k, v in tensors.items() if "/actor." in k}
+    digest = hashlib.sha256(save(weights)).hexdigest()
+    policy = _build({**card, "sha256": digest}, weights, str(run))
+    policy.extra = {
+        k.removeprefix("agent/"): v
+        for k, v in tensors.items()
+        if k.startswith(("agent/critic.", "agent/value_norm."))
+    }
+    return policy
+
+
+def _from_file(path: Path) -> Policy:
+    if path.suffix == ".json":
+        path = path.with_suffix(".safetensors")
+    card_path = path.with_suffix(".json")
+    try:
+        data = path.read_bytes()
+        weights = load_safetensors(data)
+    except (OSError, SafetensorError, ValueError) as error:
+        raise PolicyError(
+            f"'{path}' is not a policy: it is no whole safetensors file ({error})"
+        ) from error
+    try:
+        card = json.loads(card_path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise PolicyError(f"the policy's card '{card_path}' cannot be read ({error})") from error
+    if not isinstance(card, dict) or card.get("format") != FORMAT:
+        raise PolicyError(f"'{card_path}' is not the card of a policy of this project")
+    if card.get("sha256") != hashlib.sha256(data).hexdigest():
+        raise PolicyError(f"'{path}' does not belong to its card: the sha256 differs")
+    return _build(card, {k: v.float() for k, v in weights.items()}, str(path))
+
+
+def _build(card: dict[str, Any], weights: dict[str, Tensor], where: str) -> Policy:
+    """Network and statistics from a card. Raises PolicyError naming what is wrong with it."""
+    for name, kind in _REQUIRED.items():
+        value = card.get(name)
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if not isinstance(value, kind):
+            raise PolicyError(f"the card of policy '{where}' lacks a proper '{name}'")
+    sizes = [card["obs_size"], *card["hidden"], card["action_size"]]
+    if len(sizes) > MAX_LAYERS or not all(isinstance(n, int) and 0 < n < MAX_WIDTH for n in sizes):
+        raise PolicyError(f"the card of policy '{where}' has impossible layer sizes {sizes}")
+    try:
+        mean = torch.tensor(card["obs_mean"], dtype=torch.float32)
+        std = torch.tensor(card["obs_std"], dtype=torch.float32)
+        with torch.device("meta"):  # no memory before the weights are known to fit
+            actor = MLP(sizes[0], sizes[1:-1], sizes[-1], card["activation"])
+        actor.load_state_dict(weights, assign=True)
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise PolicyError(f"the weights of policy '{where}' do not fit its card: {error}") from None
+    finite = all(torch.isfinite(x).all() for x in (mean, std, *weights.values()))
+    if mean.shape != (sizes[0],) or std.shape != (sizes[0],) or not finite or (std <= 0).any():
+        raise PolicyError(f"the policy '{where}' holds numbers that are missing or not finite")
+    actor.float().requires_grad_(False)
+    return Policy(actor, mean, std, card)
+
+
+def export_policy(
+    run: Path | str, out: Path | str, *, metrics: dict[str, Any] | None = None, looks: str = ""
+) -> Path:
+    """Writes a run's actor as ``OUT.safetensors`` (fp16) and ``OUT.json``; returns the former.
+
+    Args:
+        run: the run's folder; its last checkpoint is taken.
+        out: target; any suffix becomes ``.safetensors``.
+        metrics: an evaluation's metrics for the card; the run's last ones if None.
+        looks: what the motion looks like, in words.
+
+    Raises PolicyError when the run has no readable checkpoint.
+    """
+    policy = _from_run(Path(run))
+    assert policy.actor is not None
+    weights = {k: v.half().contiguous() for k, v in policy.actor.state_dict().items()}
+    if not all(torch.isfinite(v).all() for v in weights.values()):
+        raise PolicyError(f"the weights of run '{run}' do not fit fp16")
+    data = save(weights)
+    card = dict(policy.metadata) | {"sha256": hashlib.sha256(data).hexdigest()}
+    if metrics is not None:
+        card["metrics"] = metrics
+    if looks:
+        card["looks"] = looks
+    path = Path(out).with_suffix(".safetensors")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, data)
+    text = json.dumps(card, indent=1, allow_nan=False)
+    write_atomically(path.with_suffix(".json"), text.encode())
+    return path

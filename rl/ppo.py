@@ -1,0 +1,416 @@
+"""Proximal policy optimisation (Schulman et al. 2017), one file, read top to bottom.
+
+A Gaussian policy of fixed or scheduled sigma, a critic on normalised returns, clipped surrogate,
+a penalty on means outside the action bounds, and a learning rate that follows the KL divergence.
+Matrix products run in bf16 on a GPU; log-probabilities, advantages, statistics and the optimiser
+stay in float32 or better. Between two ``update`` calls nothing waits for the device, and the
+minibatch step is replayed as one CUDA graph.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from rl.graph import GraphedStep
+from rl.networks import MLP, Activation
+from rl.normalizer import Normalizer
+from rl.rollout import Rollout, generalized_advantages
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Hyper-parameters of PPO."""
+
+    hidden: tuple[int, ...] = (1024, 512, 256)
+    """Hidden layers of actor and critic."""
+    activation: Activation = "silu"
+    """Nonlinearity of both."""
+    steps: int = 24
+    """Control steps per world and iteration."""
+    minibatches: int = 8
+    """Minibatches per epoch."""
+    epochs: int = 4
+    """Passes over the rollout per iteration."""
+    gamma: float = 0.99
+    """Discount per control step."""
+    lam: float = 0.95
+    """Decay of the generalised advantage."""
+    clip_ratio: float = 0.2
+    """Probability ratios beyond 1 +- this earn nothing."""
+    sigma: float = 0.12
+    """Standard deviation of the policy in action units (1 = the bound)."""
+    sigma_final: float | None = None
+    """Standard deviation at the end of the run, reached geometrically; None keeps ``sigma``."""
+    learning_rate: float = 3e-4
+    """First learning rate of the actor."""
+    critic_learning_rate: float = 5e-4
+    """Learning rate of the critic, constant."""
+    kl_band: tuple[float, float] | None = (0.008, 0.03)
+    """The actor's rate falls where the KL divergence of a minibatch (nats, summed over the action)
+    is above the band and rises where it is below; None keeps it constant."""
+    learning_rate_limits: tuple[float, float] = (3e-5, 1e-3)
+    """The KL control stays between these."""
+    learning_rate_factor: float = 1.5
+    """One step of the KL control."""
+    bounds_coefficient: float = 10.0
+    """Weight of the squared excess of |mean| over 1, summed over the action."""
+    entropy_coefficient: float = 0.0
+    """Must be 0: sigma is not learned, so the entropy has no gradient."""
+    critic_coefficient: float = 1.0
+    """Weight of the squared error of the normalised value."""
+    value_clip: float | None = None
+    """Values may move this far (normalised) from the rollout's; None for no clipping."""
+    grad_norm: float = 1.0
+    """Gradients of actor and critic are each scaled down to this norm."""
+    observation_clip: float = 5.0
+    """Normalised observations are clamped to +- this."""
+    critic_warmup: int = 5
+    """Iterations in which only the critic learns, after a start from a policy without one."""
+
+    def __post_init__(self) -> None:
+        if self.entropy_coefficient != 0.0:
+            raise ValueError("entropy_coefficient must be 0: this policy's sigma is not learned")
+        if not 0.0 < self.sigma or (self.sigma_final is not None and self.sigma_final <= 0.0):
+            raise ValueError(f"sigma must be positive, not {self.sigma}, {self.sigma_final}")
+        if min(self.steps, self.minibatches, self.epochs) < 1:
+            raise ValueError("steps, minibatches and epochs must be at least 1")
+
+
+STATISTICS = (
+    "kl",
+    "clip_fraction",
+    "policy_loss",
+    "value_loss",
+    "bounds_loss",
+    "explained_variance",
+)
+"""What ``PPO.update`` reports."""
+
+PAPER = replace(
+    PPOConfig(),
+    # The table of the SMPLOlympics paper ...
+    learning_rate=5e-4,
+    critic_learning_rate=5e-4,
+    kl_band=None,
+    clip_ratio=0.2,
+    gamma=0.99,
+    sigma=0.05,
+    hidden=(2048, 1024, 512),
+    minibatches=64,  # of 1024 samples at 2048 worlds
+    # ... and what only its released configuration says.
+    steps=32,
+    epochs=6,
+    lam=0.95,
+    critic_coefficient=5.0,
+    bounds_coefficient=10.0,
+    grad_norm=50.0,
+    value_clip=0.2,
+)
+"""Hyper-parameters of the SMPLOlympics paper (arXiv 2407.00187); run it with 2048 worlds."""
+
+
+def gaussian_log_prob(action: Tensor, mean: Tensor, sigma: Tensor) -> Tensor:
+    """(...) log density of action (..., U) under N(mean, sigma^2), float32."""
+    z = (action - mean) / sigma
+    constant = action.shape[-1] * (sigma.log() + 0.5 * math.log(2.0 * math.pi))
+    return -0.5 * z.square().sum(-1) - constant
+
+
+def surrogate_loss(ratio: Tensor, advantage: Tensor, clip_ratio: float) -> Tensor:
+    """(...) -min(ratio A, clip(ratio) A). Source: Schulman et al. 2017, eq. 7."""
+    clipped = ratio.clamp(1.0 - clip_ratio, 1.0 + clip_ratio)
+    return -torch.minimum(ratio * advantage, clipped * advantage)
+
+
+def adapted_rate(rate: Tensor, kl: Tensor, config: PPOConfig) -> Tensor:
+    """() learning rate after a minibatch of divergence ``kl``, on the device."""
+    if config.kl_band is None:
+        return rate
+    (low, high), (least, most) = config.kl_band, config.learning_rate_limits
+    slower = (rate / config.learning_rate_factor).clamp(min=least)
+    faster = (rate * config.learning_rate_factor).clamp(max=most)
+    return torch.where(kl > high, slower, torch.where(kl < low, faster, rate))
+
+
+class PPO:
+    """Actor, critic, their normalisers and their optimiser."""
+
+    def __init__(
+        self,
+        obs_size: int,
+        action_size: int,
+        config: PPOConfig,
+        device: torch.device | str = "cpu",
+        seed: int = 0,
+        cuda_graph: bool = True,
+    ) -> None:
+        """Args:
+        obs_size: features D of an observation.
+        action_size: numbers U in an action.
+        config: hyper-parameters.
+        device: where networks and rollouts live.
+        seed: of the first weights (equal on all ranks) and of the noise (mixed with the rank).
+        cuda_graph: replay the minibatch step as a graph where that is possible.
+        """
+        self.config, self.device = config, torch.device(device)
+        weights = torch.Generator().manual_seed(seed)
+        self.actor = MLP(obs_size, config.hidden, action_size, config.activation, 0.01, weights)
+        self.critic = MLP(obs_size, config.hidden, 1, config.activation, 1.0, weights)
+        self.actor.to(self.device)
+        self.critic.to(self.device)
+        self.obs_norm = Normalizer(obs_size, self.device, clip=config.observation_clip)
+        self.value_norm = Normalizer(1, self.device, clip=math.inf)
+        self.world_size = dist.get_world_size() if dist.is_initialized() else 1
+        rank = dist.get_rank() if dist.is_initialized() else 0
+        self.generator = torch.Generator(self.device).manual_seed(seed + 1 + 1_000_003 * rank)
+
+        def scalar(value: float) -> Tensor:
+            return torch.tensor(value, dtype=torch.float32, device=self.device)
+
+        self.sigma = scalar(config.sigma)
+        self.learning_rate = scalar(config.learning_rate)
+        self.actor_weight = scalar(1.0)
+        """0 while only the critic learns."""
+        cuda = self.device.type == "cuda"
+        self.obs_dtype = torch.bfloat16 if cuda else torch.float32
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": list(self.actor.parameters()), "lr": self.learning_rate},
+                {
+                    "params": list(self.critic.parameters()),
+                    "lr": scalar(config.critic_learning_rate),
+                },
+            ],
+            fused=True,
+            capturable=cuda,
+        )
+        self._stats = torch.zeros(5, device=self.device)
+        self._batch: dict[str, Tensor] = {}
+        wanted = cuda_graph and cuda and self.world_size == 1
+        self._step = GraphedStep(self._minibatch, self.optimizer.zero_grad, wanted)
+
+    def new_rollout(self, rows: int) -> Rollout:
+        """Storage for ``rows`` = worlds x agents. Raises ValueError if too few for minibatches."""
+        c = self.config
+        if c.steps * rows < c.minibatches:
+            raise ValueError(
+                f"{c.steps} steps of {rows} worlds x agents cannot be cut into {c.minibatches} "
+                "minibatches: use more worlds or fewer minibatches"
+            )
+        outputs = self.actor.head.out_features
+        inputs = self.obs_norm.mean.numel()
+        return Rollout(c.steps, rows, inputs, outputs, self.device, self.obs_dtype)
+
+    # -- acting ---------------------------------------------------------------------------------
+
+    def _autocast(self) -> torch.autocast:
+        # Without the cache: casts made inside a captured graph must not outlive it.
+        return torch.autocast(
+            self.device.type,
+            dtype=torch.bfloat16,
+            enabled=self.device.type == "cuda",
+            cache_enabled=False,
+        )
+
+    def prepare(self, obs: Tensor) -> Tensor:
+        """(M, D) raw observations -> normalised, in the storage type. NaN becomes 0."""
+        return self.obs_norm.normalize(torch.nan_to_num(obs)).to(self.obs_dtype)
+
+    @torch.no_grad()
+    def act(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """obs (M, D) raw -> stored obs (M, D), action (M, U), mean (M, U), log-prob (M,)."""
+        self.obs_norm.collect(torch.nan_to_num(obs))
+        stored = self.prepare(obs)
+        with self._autocast():
+            mean = self.actor(stored)
+        noise = torch.randn(mean.shape, device=self.device, generator=self.generator)
+        action = mean + self.sigma * noise
+        return stored, action, mean, gaussian_log_prob(action, mean, self.sigma)
+
+    @torch.no_grad()
+    def value(self, stored: Tensor) -> Tensor:
+        """(..., D) stored observations -> (...) discounted return expected (scaled reward)."""
+        with self._autocast():
+            return self.value_norm.denormalize(self.critic(stored)).squeeze(-1)
+
+    # -- learning -------------------------------------------------------------------------------
+
+    def update(self, rollout: Rollout) -> dict[str, Tensor]:
+        """Learns from a rollout; the next one may overwrite it. Returns () statistics.
+
+        kl, clip_fraction, policy_loss, value_loss, bounds_loss: means over all minibatches;
+        explained_variance: of the returns by the critic before the update.
+        """
+        c = self.config
+        value = self._compute_advantages(rollout)
+        self.value_norm.collect(rollout.returns, rollout.valid)
+        self.value_norm.commit()
+        self._prepare_batch(rollout, value)
+        self._stats.zero_()
+        size = rollout.steps * rollout.rows
+        for _ in range(c.epochs):
+            order = torch.randperm(size, device=self.device, generator=self.generator)
+            for rows in order.split(size // c.minibatches)[: c.minibatches]:
+                self._step(rows)
+        self.obs_norm.commit()
+        unexplained = (rollout.returns - value).var() / rollout.returns.var().clamp(min=1e-8)
+        means = self._stats / (c.epochs * c.minibatches)
+        return dict(zip(STATISTICS, (*means.unbind(), 1.0 - unexplained)))
+
+    def observe_only(self) -> None:
+        """Ends an iteration that only gathered observation statistics."""
+        self.obs_norm.commit()
+
+    def _compute_advantages(self, r: Rollout) -> Tensor:
+        """Fills advantages and returns of the rollout; returns its values (T, M)."""
+        value, next_value = self.value(r.obs), self.value(r.final_obs)
+        advantages, returns = generalized_advantages(
+            r.reward,
+            value,
+            next_value,
+            r.terminated,
+            r.truncated,
+            r.valid,
+            self.config.gamma,
+            self.config.lam,
+        )
+        r.advantages.copy_(advantages)
+        r.returns.copy_(returns)
+        return value
+
+    def _prepare_batch(self, r: Rollout, value: Tensor) -> None:
+        """Flat views (T M, ...) and the quantities that every minibatch needs."""
+        valid = r.valid.double()
+        a = r.advantages.double()
+        sums = torch.stack((valid.sum(), (valid * a).sum(), (valid * a * a).sum()))
+        total = float(valid.numel() * self.world_size)
+        if self.world_size > 1:
+            dist.all_reduce(sums)
+        count = sums[0].clamp(min=1.0)
+        mean = sums[1] / count
+        std = (sums[2] / count - mean.square()).clamp(min=0.0).sqrt()
+        batch = {
+            "obs": r.obs,
+            "action": r.action,
+            "mean": r.mean,
+            "log_prob": r.log_prob,
+            "advantage": (a - mean) / (std + 1e-8),
+            "target": self.value_norm.normalize(r.returns),
+            "value": self.value_norm.normalize(value),
+            # Averages over a minibatch of these weights are averages over its valid samples.
+            "weight": valid * (total / count),
+        }
+        for name, x in batch.items():
+            flat = x.flatten(0, 1)
+            if name in ("obs", "action", "mean", "log_prob"):
+                self._batch[name] = flat  # views of the rollout: the addresses stay
+            elif name in self._batch:
+                self._batch[name].copy_(flat)
+            else:
+                self._batch[name] = flat.float()
+
+    def _minibatch(self, rows: Tensor) -> None:
+        """One gradient step of actor and critic on the samples ``rows`` (m,) of the batch."""
+        c, b = self.config, {name: x[rows] for name, x in self._batch.items()}
+        weight = b["weight"]
+        with self._autocast():
+            mean = self.actor(b["obs"])
+            value = self.critic(b["obs"]).squeeze(-1)
+        ratio = (gaussian_log_prob(b["action"], mean, self.sigma) - b["log_prob"]).exp()
+        policy_loss = (weight * surrogate_loss(ratio, b["advantage"], c.clip_ratio)).mean()
+        bounds_loss = (weight * (mean.abs() - 1.0).clamp(min=0.0).square().sum(-1)).mean()
+        error = (value - b["target"]).square()
+        if c.value_clip is not None:
+            moved = b["value"] + (value - b["value"]).clamp(-c.value_clip, c.value_clip)
+            error = torch.maximum(error, (moved - b["target"]).square())
+        value_loss = (weight * error).mean()
+        actor_loss = policy_loss + c.bounds_coefficient * bounds_loss
+        self.optimizer.zero_grad(set_to_none=True)
+        (self.actor_weight * actor_loss + c.critic_coefficient * value_loss).backward()
+        with torch.no_grad():
+            divergence = (mean - b["mean"]).square().sum(-1) / (2.0 * self.sigma.square())
+            kl = (weight * divergence).mean()
+            clipped = (weight * ((ratio - 1.0).abs() > c.clip_ratio)).mean()
+            stats = torch.stack((kl, clipped, policy_loss, value_loss, bounds_loss))
+            if self.world_size > 1:
+                self._average_over_ranks(stats)
+            self.learning_rate.copy_(adapted_rate(self.learning_rate, stats[0], c))
+            self._stats += stats
+        nn.utils.clip_grad_norm_(self.actor.parameters(), c.grad_norm, foreach=True)
+        nn.utils.clip_grad_norm_(self.critic.parameters(), c.grad_norm, foreach=True)
+        self.optimizer.step()
+
+    def _average_over_ranks(self, stats: Tensor) -> None:
+        """Gradients and statistics become their means over the ranks, in one message."""
+        grads = [p.grad for p in self._named_parameters().values() if p.grad is not None]
+        flat = torch.cat([stats, *(g.flatten() for g in grads)])
+        dist.all_reduce(flat)
+        flat /= self.world_size
+        parts = flat.split([stats.numel(), *(g.numel() for g in grads)])
+        stats.copy_(parts[0])
+        torch._foreach_copy_(grads, [p.view_as(g) for p, g in zip(parts[1:], grads)])
+
+    # -- state ----------------------------------------------------------------------------------
+
+    def _named_parameters(self) -> dict[str, nn.Parameter]:
+        return {
+            f"{part}.{name}": p
+            for part, module in (("actor", self.actor), ("critic", self.critic))
+            for name, p in module.named_parameters()
+        }
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that decides the next update, by name: weights, moments, rates, noise."""
+        state = {name: p.detach() for name, p in self._named_parameters().items()}
+        for name, p in self._named_parameters().items():
+            for key, x in self.optimizer.state[p].items():
+                state[f"adam.{name}.{key}"] = x
+        for part, norm in (("obs_norm", self.obs_norm), ("value_norm", self.value_norm)):
+            state |= {f"{part}.{key}": x for key, x in norm.state_dict().items()}
+        state |= {"sigma": self.sigma, "learning_rate": self.learning_rate}
+        return state | {"generator": self.generator.get_state()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Takes a state back. Raises ValueError where it does not fit."""
+        with torch.no_grad():
+            for name, p in self._named_parameters().items():
+                if name not in state or state[name].shape != p.shape:
+                    raise ValueError(f"the checkpoint's '{name}' does not fit this network")
+                p.copy_(state[name])
+                prefix = f"adam.{name}."
+                moments = {k: x for k, x in state.items() if k.startswith(prefix)}
+                if moments:
+                    self.optimizer.state[p] = {
+                        key.removeprefix(prefix): x.clone().to(self.device)
+                        for key, x in moments.items()
+                    }
+            for part, norm in (("obs_norm", self.obs_norm), ("value_norm", self.value_norm)):
+                keys = ("total", "pending")
+                norm.load_state_dict({key: state[f"{part}.{key}"] for key in keys})
+            self.sigma.copy_(state["sigma"])
+            self.learning_rate.copy_(state["learning_rate"])
+            self.generator.set_state(state["generator"].cpu())
+
+    def load_policy(self, actor: nn.Module, mean: Tensor, std: Tensor, count: float) -> None:
+        """Starts from another policy's actor and observation statistics. Raises ValueError."""
+        try:
+            self.actor.load_state_dict(actor.state_dict())
+        except RuntimeError as error:
+            raise ValueError(f"the policy's network does not fit the run's: {error}") from error
+        self.obs_norm.set_moments(count, mean, std)
+
+    def load_critic(self, extra: dict[str, Tensor]) -> bool:
+        """Takes a critic and its statistics where ``extra`` has one that fits; whether it did."""
+        weights = {k.removeprefix("critic."): v for k, v in extra.items() if "critic." in k}
+        own = self.critic.state_dict()
+        if {k: v.shape for k, v in weights.items()} != {k: v.shape for k, v in own.items()}:
+            return False
+        self.critic.load_state_dict(weights)
+        keys = ("total", "pending")
+        self.value_norm.load_state_dict({key: extra[f"value_norm.{key}"] for key in keys})
+        return True
