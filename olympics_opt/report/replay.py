@@ -1,0 +1,370 @@
+"""A 3-D replay inside a page: motions, scene and player in one piece of HTML.
+
+The fragment needs no library, no WebGL and no network: the states are packed as 16-bit numbers,
+the page computes the link poses (``replay_scene.js``) and draws them on a canvas (``replay.js``).
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from html import escape
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from olympics_opt.scenery import complete_qpos, ground_marks, link_color
+from sports.humanoid.body import Shape
+from sports.scene import Scene, SceneObject
+
+MAX_RATE = 60.0
+"""Frames per second kept; faster recordings are resampled."""
+COLORS = ("#5b6673", "#c2408f", "#1c8a5a", "#8a63d2", "#b58900", "#0f8b8d")
+"""Colours of the tracks; the first track's athlete is drawn in its limb colours."""
+
+
+@dataclass(frozen=True)
+class ReplayTrack:
+    """One motion of the scene."""
+
+    name: str
+    """What the legend calls it."""
+    qpos: np.ndarray
+    """(T, nq) of the scene, or (T, 7 + num_dofs) of its first athlete alone."""
+    dt: float
+    """Seconds between frames."""
+    mocap_pos: np.ndarray | None = None
+    """(T, M, 3) positions of the movable fixtures; None where the scene puts them."""
+    ground_force: np.ndarray | None = None
+    """(T, A, B, 3) force of the ground on each link (N), drawn as arrows on request."""
+    start: float = 0.0
+    """Time of the first frame on the common clock (s)."""
+
+    def __post_init__(self) -> None:
+        qpos = np.atleast_2d(np.asarray(self.qpos, dtype=float))
+        if len(qpos) == 0 or not np.isfinite(qpos).all():
+            raise ValueError(f"replay track '{self.name}': qpos is empty or not finite")
+        if not self.dt > 0:
+            raise ValueError(f"replay track '{self.name}': dt must be positive, not {self.dt}")
+        object.__setattr__(self, "qpos", qpos)
+
+    @classmethod
+    def from_episode(cls, episode: Any, name: str) -> ReplayTrack:
+        """A track of a recorded episode (`rl.evaluate.Recording`)."""
+        return cls(
+            name,
+            episode.qpos,
+            episode.dt,
+            mocap_pos=episode.mocap_pos,
+            ground_force=episode.ground_force,
+        )
+
+    @classmethod
+    def from_clip(cls, clip: Any, name: str) -> ReplayTrack:
+        """A track of a motion clip (`warmstart.clip.Clip`)."""
+        return cls(name, clip.qpos, 1.0 / clip.fps)
+
+
+def aligned(tracks: Iterable[ReplayTrack], x: float = 20.0) -> list[ReplayTrack]:
+    """Tracks shifted in time so that the athlete passes ``x`` (m) at the same moment in all.
+
+    A track that never passes it ends with the others' passing. The earliest starts at 0.
+    """
+    tracks = list(tracks)
+    passing = []
+    for track in tracks:
+        beyond = np.flatnonzero(track.qpos[:, 0] >= x)
+        passing.append((beyond[0] if len(beyond) else len(track.qpos) - 1) * track.dt)
+    latest = max(passing, default=0.0)
+    return [replace(track, start=latest - when) for track, when in zip(tracks, passing)]
+
+
+def pack(table: np.ndarray) -> dict[str, Any]:
+    """A (T, K) table as 16-bit steps between each column's least and greatest value.
+
+    Columns that never change are stored once. The error is at most half a step:
+    (greatest - least) / 131070.
+    """
+    table = np.asarray(table, dtype=float)
+    low, high = table.min(0), table.max(0)
+    columns = np.flatnonzero(high - low > 1e-7)
+    step = (high - low)[columns] / 65535.0
+    whole = np.rint((table[:, columns] - low[columns]) / step).astype("<u2")
+    return {
+        "frames": len(table),
+        "base": [float(f"{v:.7g}") for v in low],
+        "columns": columns.tolist(),
+        "step": [float(f"{v:.9g}") for v in step],
+        "data": base64.b64encode(whole.tobytes()).decode("ascii"),
+    }
+
+
+def unpack(packed: dict[str, Any]) -> np.ndarray:
+    """(T, K) the table that :func:`pack` stored; the page's script does the same."""
+    columns = packed["columns"]
+    whole = np.frombuffer(base64.b64decode(packed["data"]), dtype="<u2")
+    table = np.tile(np.array(packed["base"], dtype=float), (packed["frames"], 1))
+    table[:, columns] += whole.reshape(packed["frames"], len(columns)) * np.array(packed["step"])
+    return table
+
+
+def _continuous(qpos: np.ndarray, scene: Scene) -> np.ndarray:
+    """Quaternions of neighbouring frames on the same side, so that they can be interpolated."""
+    qpos = qpos.copy()
+    starts = [scene.agent_qpos(a).start + 3 for a in range(scene.num_agents)]
+    starts += [scene.object_qpos(o.name).start + 3 for o in scene.free_objects]
+    for start in starts:
+        quat = qpos[:, start : start + 4]
+        flips = np.cumprod(np.where((quat[1:] * quat[:-1]).sum(1) < 0, -1.0, 1.0))
+        quat[1:] *= flips[:, None]
+    return qpos
+
+
+def _resampled(table: np.ndarray, dt: float) -> tuple[np.ndarray, float]:
+    """A table at no more than 60 frames per second, linear between its frames."""
+    if len(table) < 2 or 1.0 / dt <= MAX_RATE * 1.01:
+        return table, dt
+    times = np.arange(len(table)) * dt
+    count = max(2, int(times[-1] * MAX_RATE) + 1)
+    wanted = np.linspace(0.0, times[-1], count)
+    flat = table.reshape(len(table), -1)
+    columns = np.stack([np.interp(wanted, times, column) for column in flat.T], axis=1)
+    return columns.reshape(count, *table.shape[1:]), float(wanted[1])
+
+
+def _track(scene: Scene, track: ReplayTrack, color: str) -> dict[str, Any]:
+    qpos, dt = _resampled(_continuous(complete_qpos(scene, track.qpos), scene), track.dt)
+    packed: dict[str, Any] = {
+        "name": track.name,
+        "color": color,
+        "start": round(track.start, 5),
+        "dt": dt,
+        "qpos": pack(qpos),
+    }
+    fixtures = len(scene.mocap_objects)
+    if fixtures:
+        mocap = track.mocap_pos
+        if mocap is None or np.size(mocap) == 0:
+            mocap = np.broadcast_to(scene.default_mocap_pos(), (len(qpos), fixtures, 3))
+        else:
+            mocap, _ = _resampled(np.asarray(mocap, dtype=float), track.dt)
+        packed["mocap"] = pack(np.reshape(mocap, (len(mocap), 3 * fixtures)))
+    if track.ground_force is not None and np.size(track.ground_force):
+        force, _ = _resampled(np.asarray(track.ground_force, dtype=float), track.dt)
+        force = np.where(np.linalg.norm(force, axis=-1, keepdims=True) > 20.0, force, 0.0)
+        packed["force"] = pack(np.reshape(force, (len(force), -1)))
+    return packed
+
+
+def _shape(shape: Shape) -> dict[str, Any]:
+    row = {"kind": shape.kind, "center": shape.center, "size": shape.size}
+    return row if shape.end is None else {**row, "end": shape.end}
+
+
+def _object(o: SceneObject) -> dict[str, Any]:
+    channels = (round(255 * min(max(c, 0.0), 1.0)) for c in o.rgba[:3])
+    return {
+        "motion": o.motion,
+        "pos": o.pos,
+        "quat": o.quat,
+        "color": "#" + "".join(f"{c:02x}" for c in channels),
+        "shapes": [_shape(s) for s in o.shapes],
+    }
+
+
+def _scene(scene: Scene) -> dict[str, Any]:
+    return {
+        "agents": scene.num_agents,
+        "links": [
+            {
+                "name": link.name,
+                "parent": int(parent),
+                "offset": link.offset,
+                "color": link_color(link.name),
+                "shapes": [_shape(s) for s in link.shapes],
+            }
+            for link, parent in zip(scene.body.links, scene.body.parents())
+        ],
+        "objects": [_object(o) for o in scene.objects],
+        "marks": [
+            {"corners": m.corners, "color": m.color, "label": m.label} for m in ground_marks(scene)
+        ],
+    }
+
+
+def replay_data(
+    scene: Scene,
+    tracks: Sequence[ReplayTrack],
+    *,
+    poster: float | None = None,
+    autoplay: bool = False,
+) -> dict[str, Any]:
+    """Everything the page's player needs, as plain JSON values.
+
+    Args:
+        scene: athletes and objects; all tracks share it.
+        tracks: at least one motion.
+        poster: time of the picture before playing starts (s); by default the highest moment of
+            the first track.
+        autoplay: start by itself, unless the reader asked for reduced motion.
+
+    Raises:
+        ValueError: no tracks, or a track that does not fit the scene.
+    """
+    if not tracks:
+        raise ValueError("a replay needs at least one track")
+    first = tracks[0]
+    if poster is None:
+        poster = first.start + float(first.qpos[:, 2].argmax()) * first.dt
+    way = first.qpos[-1, :2] - first.qpos[0, :2]
+    heading = math.atan2(way[1], way[0]) if np.hypot(*way) > 0.5 else 0.0
+    return {
+        "scene": _scene(scene),
+        "tracks": [_track(scene, t, COLORS[i % len(COLORS)]) for i, t in enumerate(tracks)],
+        "poster": round(poster, 4),
+        "heading": round(heading, 4),
+        "yaw": round(heading + math.radians(64), 4),
+        "autoplay": autoplay,
+    }
+
+
+@cache
+def _text(name: str) -> str:
+    return resources.files("olympics_opt.report").joinpath(name).read_text(encoding="utf-8")
+
+
+_CONTROLS = """\
+<div class="replay-picture">
+<canvas data-replay="canvas" role="img" aria-label="{title}"></canvas>
+<output class="replay-facts" data-replay="facts"></output>
+</div>
+<div class="replay-bar">
+<button type="button" data-replay="play" aria-label="Play">▶</button>
+<input type="range" data-replay="scrub" step="any" aria-label="Time">
+<output class="replay-time" data-replay="time"></output>
+<label>Speed <select data-replay="speed">
+<option value="0.1">0.1×</option><option value="0.25">0.25×</option>
+<option value="0.5">0.5×</option><option value="1" selected>1×</option>
+<option value="2">2×</option></select></label>
+<label>View <select data-replay="look">
+<option value="start">three-quarter</option><option value="side">side</option>
+<option value="front">front</option><option value="behind">behind</option>
+<option value="top">top</option></select></label>
+</div>
+<div class="replay-bar">
+<div class="replay-legend" data-replay="legend"></div>
+<label><input type="checkbox" data-replay="split"> side by side</label>
+<label><input type="checkbox" data-replay="follow" checked> follow</label>
+<label><input type="checkbox" data-replay="trails" checked> path</label>
+<label><input type="checkbox" data-replay="forces"> ground forces</label>
+<span class="replay-help">drag to turn · click, then wheel to zoom · space plays · ← → step</span>
+</div>
+"""
+
+
+def replay_html(
+    scene: Scene,
+    tracks: Sequence[ReplayTrack],
+    *,
+    title: str,
+    element_id: str,
+    poster: float | None = None,
+    autoplay: bool = False,
+) -> str:
+    """A replay as a self-contained HTML fragment: style, picture, controls, data and script.
+
+    Args:
+        scene: athletes and objects; all tracks share it.
+        tracks: motions, overlaid or side by side; the first leads the camera and is drawn in
+            limb colours (left blue, right orange).
+        title: read out for the picture.
+        element_id: id of the fragment's outer element, unique on the page.
+        poster: time of the first picture (s); default: highest moment of the first track.
+        autoplay: start by itself, unless the reader asked for reduced motion.
+
+    Returns:
+        HTML text. A page may hold several; the script is guarded against running twice.
+
+    Raises:
+        ValueError: no tracks, a track that does not fit the scene, or an unfit id.
+    """
+    if not element_id.replace("-", "").replace("_", "").isalnum():
+        raise ValueError(f"element id '{element_id}' may hold letters, digits, - and _ only")
+    data = replay_data(scene, tracks, poster=poster, autoplay=autoplay)
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    script = _text("replay_scene.js") + _text("replay.js")
+    return (
+        f'<div class="replay" id="{element_id}" tabindex="0" role="group" '
+        f'aria-label="3-D replay: {escape(title)}">\n'
+        f"<style>{_text('replay.css')}</style>\n"
+        f"{_CONTROLS.format(title=escape(title))}"
+        f'<script type="application/json" data-replay="data">{text}</script>\n'
+        "<script>\n"
+        f"window.OlympicsReplay ??= (() => {{{script}\nreturn Replay;}})();\n"
+        f'{{const root = document.getElementById("{element_id}");\n'
+        "root.replay = window.OlympicsReplay.mount("
+        "root, JSON.parse(root.querySelector('[data-replay=\"data\"]').textContent));}\n"
+        "</script>\n</div>"
+    )
+
+
+def preview_html(
+    scene: Scene,
+    tracks: Sequence[ReplayTrack],
+    *,
+    title: str,
+    subtitle: str = "",
+    facts: Sequence[tuple[str, str]] = (),
+    checks: Sequence[dict[str, Any]] = (),
+) -> str:
+    """A page of its own around a replay: what `solve` shows of a motion.
+
+    Args:
+        scene: athletes and objects.
+        tracks: motions.
+        title: heading.
+        subtitle: one sentence below it.
+        facts: (name, value) pairs.
+        checks: rows of a certificate: name, value, limit, unit, passed.
+
+    Returns:
+        A complete HTML document without external references.
+    """
+    rows = "".join(
+        f'<div class="tile"><div class="name">{escape(name)}</div>'
+        f'<div class="value">{escape(value)}</div></div>'
+        for name, value in facts
+    )
+    table = ""
+    if checks:
+        body = "".join(
+            f"<tr><td>{escape(str(c['name']))}</td>"
+            f'<td class="num">{_figure(c.get("value"))}</td>'
+            f'<td class="num">{_figure(c.get("limit"))}</td>'
+            f"<td>{escape(str(c.get('unit', '')))}</td>"
+            f'<td class="{"good" if c.get("passed") else "bad"}">'
+            f"{'passed' if c.get('passed') else 'FAILED'}</td></tr>"
+            for c in checks
+        )
+        table = (
+            '<h2>Certificate</h2><div class="scroll"><table><thead><tr><th>check</th>'
+            '<th class="num">value</th><th class="num">limit</th><th>unit</th><th></th></tr>'
+            f"</thead><tbody>{body}</tbody></table></div>"
+        )
+    replay = replay_html(scene, tracks, title=title, element_id="replay", autoplay=True)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title>\n<style>{_text('style.css')}</style></head>\n<body>"
+        f'<h1>{escape(title)}</h1><p class="lead">{escape(subtitle)}</p>\n'
+        f'{replay}\n<div class="tiles">{rows}</div>\n{table}\n</body></html>\n'
+    )
+
+
+def _figure(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, int | float) else escape(str(value or ""))
