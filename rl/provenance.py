@@ -16,7 +16,13 @@ PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "drake", "casadi", "torch", "n
 
 @cache
 def commit() -> str:
-    """The project's commit, with ``+`` where files differ from it; ``unknown`` outside git."""
+    """The project's commit, with ``+`` where files differ from it; ``unknown`` outside git.
+
+    A copy without its repository (a training host) may be told by OLYMPICS_OPT_COMMIT.
+    """
+    told = os.environ.get("OLYMPICS_OPT_COMMIT", "")
+    if told:
+        return told
     root = Path(__file__).resolve().parents[1]
 
     def git(*args: str) -> str:
