@@ -164,7 +164,8 @@ def load_checkpoint(path: Path, rank: int = 0) -> tuple[dict[str, Any], dict[str
             tensors[name] = flat.reshape(entry["shape"])
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise CheckpointError(
-            f"the checkpoint {path} cannot be read ({error}): remove it to go on from an earlier"
+            f"the checkpoint {path} cannot be read ({error}): remove it to go on from an earlier "
+            "one"
         ) from error
     return state, tensors
 

@@ -1,0 +1,219 @@
+"""PPO against closed forms, autograd of the textbook loss, and permutations."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from rl.ppo import PAPER, PPO, PPOConfig, adapted_rate, gaussian_log_prob, surrogate_loss
+from rl.rollout import Rollout
+from rl.train import train
+from tests.rl.toy import SMALL, A, B, Q, R, Integrator, optimal_cost, toy_config, toy_env
+
+
+def filled_rollout(agent: PPO, rows: int, seed: int) -> tuple[Rollout, torch.Tensor]:
+    """A rollout of made-up numbers, and its raw observations."""
+    g = torch.Generator().manual_seed(seed)
+    r = agent.new_rollout(rows)
+    raw = torch.randn(r.obs.shape, generator=g)
+    with torch.no_grad():
+        for t in range(r.steps):
+            r.obs[t] = agent.prepare(raw[t])
+            r.final_obs[t] = agent.prepare(torch.randn(raw[t].shape, generator=g))
+            r.mean[t] = agent.actor(r.obs[t])
+        r.action.copy_(r.mean + agent.sigma * torch.randn(r.mean.shape, generator=g))
+        r.log_prob.copy_(gaussian_log_prob(r.action, r.mean, agent.sigma))
+    r.reward.copy_(torch.randn(r.reward.shape, generator=g))
+    r.terminated.copy_(torch.rand(r.reward.shape, generator=g) < 0.05)
+    r.truncated.copy_((torch.rand(r.reward.shape, generator=g) < 0.05) & ~r.terminated)
+    r.valid.copy_(torch.rand(r.reward.shape, generator=g) > 0.05)
+    return r, raw
+
+
+def test_reaches_the_optimum_of_a_linear_quadratic_problem(tmp_path):
+    config = dataclasses.replace(SMALL, sigma_final=0.05, learning_rate=1e-3)
+    run = toy_config(tmp_path, samples=70 * 64 * 16, ppo=config)
+    envs = []
+    train(run, environment=lambda c, s: envs.append(toy_env(c, s)) or envs[-1])
+    from rl.policy import load_policy
+
+    policy = load_policy(tmp_path, "toy")
+    P, K = optimal_cost(config.gamma)
+    rng = np.random.default_rng(1)
+    x0 = rng.uniform(-1, 1, (200, 2))
+
+    def cost(act) -> float:
+        x, total = x0.copy(), 0.0
+        for t in range(200):
+            a = act(x)
+            total += config.gamma**t * (((x @ Q) * x).sum(-1) + R[0, 0] * a[:, 0] ** 2)
+            x = x @ A.T + a @ B.T
+        return float(total.mean())
+
+    best = float(np.einsum("ni,ij,nj->n", x0, P, x0).mean())
+    assert cost(lambda x: -x @ K.T) == pytest.approx(best, rel=1e-3)  # the closed form itself
+    learned = cost(lambda x: policy(torch.tensor(x, dtype=torch.float32)).double().numpy())
+    idle = cost(lambda x: np.zeros((len(x), 1)))
+    print(f"cost: optimal {best:.4f}, learned {learned:.4f}, idle {idle:.4f}")
+    assert best * 0.999 <= learned <= 1.10 * best
+    assert idle > 2.0 * best
+
+
+def test_surrogate_gradient_is_that_of_the_textbook_case_distinction():
+    g = torch.Generator().manual_seed(3)
+    ratio = (1.0 + 0.5 * torch.randn(500, generator=g)).requires_grad_()
+    advantage = torch.randn(500, generator=g)
+    surrogate_loss(ratio, advantage, 0.2).sum().backward()
+    r, a = ratio.detach(), advantage
+    # Nothing is earned by moving on where the ratio has already left the trust interval on the
+    # side that the advantage asks for; else the gradient is the advantage's.
+    stopped = ((a > 0) & (r > 1.2)) | ((a < 0) & (r < 0.8))
+    torch.testing.assert_close(ratio.grad, torch.where(stopped, 0.0, -a))
+
+
+def test_log_prob_is_that_of_torch_distributions():
+    g = torch.Generator().manual_seed(0)
+    mean, action = torch.randn(2, 50, 7, generator=g)
+    sigma = torch.tensor(0.3)
+    expected = torch.distributions.Normal(mean, sigma).log_prob(action).sum(-1)
+    torch.testing.assert_close(gaussian_log_prob(action, mean, sigma), expected)
+
+
+def test_one_minibatch_step_is_the_reference_step():
+    """One epoch of one minibatch: Adam's first step from autograd of the written-out objective."""
+    config = PPOConfig(
+        hidden=(16,), steps=5, minibatches=1, epochs=1, kl_band=None, grad_norm=1e9, sigma=0.2
+    )
+    agent, reference = (PPO(3, 2, config, seed=1) for _ in range(2))
+    with torch.no_grad():  # means outside the bounds too, and a policy that has moved
+        for a in (agent, reference):
+            a.actor.head.bias += torch.tensor([1.1, -0.4])
+    rollout, _ = filled_rollout(agent, 30, seed=5)
+    rollout.mean.add_(0.05)
+    rollout.log_prob.copy_(gaussian_log_prob(rollout.action, rollout.mean, agent.sigma))
+    agent.update(rollout)
+
+    keep = rollout.valid.flatten()
+    obs = rollout.obs.flatten(0, 1)[keep]
+    action, old = rollout.action.flatten(0, 1)[keep], rollout.mean.flatten(0, 1)[keep]
+    advantage = rollout.advantages.flatten()[keep]
+    advantage = (advantage - advantage.mean()) / advantage.std(unbiased=False)
+    returns = rollout.returns.flatten()[keep]
+    target = (returns - returns.mean()) / (returns.var(unbiased=False) + 1e-4).sqrt()
+    mean = reference.actor(obs)
+    new = torch.distributions.Normal(mean, 0.2).log_prob(action).sum(-1)
+    was = torch.distributions.Normal(old, 0.2).log_prob(action).sum(-1)
+    ratio = (new - was).exp()
+    policy = torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
+    excess = (mean.abs() - 1.0).clamp(min=0.0).square().sum(-1).mean()
+    critic = (reference.critic(obs).squeeze(-1) - target).square().mean()
+    (-policy + 10.0 * excess + critic).backward()
+    torch.optim.Adam(
+        [
+            {"params": reference.actor.parameters(), "lr": config.learning_rate},
+            {"params": reference.critic.parameters(), "lr": config.critic_learning_rate},
+        ]
+    ).step()
+    assert float(excess.detach()) > 0
+    for part in ("actor", "critic"):
+        ours, theirs = getattr(agent, part).state_dict(), getattr(reference, part).state_dict()
+        for name in ours:
+            torch.testing.assert_close(ours[name], theirs[name], rtol=1e-4, atol=2e-6)
+
+
+def test_permuted_worlds_learn_the_same():
+    config = PPOConfig(hidden=(16,), steps=4, minibatches=1, epochs=3)
+    agents = [PPO(3, 2, config, seed=1) for _ in range(2)]
+    rollout, _ = filled_rollout(agents[0], 40, seed=2)
+    permuted, _ = filled_rollout(agents[1], 40, seed=2)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
+    for name, x in vars(permuted).items():
+        if isinstance(x, torch.Tensor):
+            x.copy_(getattr(rollout, name)[:, order])
+    for agent, r in zip(agents, (rollout, permuted)):
+        agent.update(r)
+    for a, b in zip(agents[0].actor.parameters(), agents[1].actor.parameters()):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_invalid_samples_teach_nothing():
+    """Whatever stands in a masked sample, the weights after the update are the same bits."""
+    config = PPOConfig(hidden=(16,), steps=4, minibatches=2, epochs=2)
+    results = []
+    for junk in (0.0, 37.0):
+        agent = PPO(3, 2, config, seed=1)
+        rollout, _ = filled_rollout(agent, 40, seed=2)
+        bad = ~rollout.valid
+        rollout.reward[bad] = junk
+        rollout.final_obs[bad] = junk
+        agent.update(rollout)
+        results.append(agent.actor.head.weight.detach().clone())
+    assert bad.any()
+    torch.testing.assert_close(results[0], results[1], rtol=0, atol=0)
+
+
+def test_rate_follows_the_divergence_within_its_limits():
+    config = PPOConfig()
+    low, high = config.kl_band
+    rate = torch.tensor(1e-4)
+    assert adapted_rate(rate, torch.tensor(2 * high), config) < rate
+    assert adapted_rate(rate, torch.tensor(low / 2), config) > rate
+    assert adapted_rate(rate, torch.tensor((low + high) / 2), config) == rate
+    for kl, limit in ((1.0, config.learning_rate_limits[0]), (0.0, config.learning_rate_limits[1])):
+        x = rate
+        for _ in range(50):
+            x = adapted_rate(x, torch.tensor(kl), config)
+        assert float(x) == pytest.approx(limit)
+    fixed = dataclasses.replace(config, kl_band=None)
+    assert adapted_rate(rate, torch.tensor(1.0), fixed) == rate
+
+
+def test_control_keeps_the_divergence_of_a_run_near_its_band(tmp_path):
+    """From a hundred times too small a rate the control finds the band; a fixed one stays idle."""
+    seen = {}
+    for name, band in (("adaptive", (0.008, 0.03)), ("fixed", None)):
+        config = dataclasses.replace(
+            SMALL, learning_rate=1e-5, kl_band=band, learning_rate_limits=(1e-5, 1e-2)
+        )
+        rows = []
+        run = toy_config(tmp_path / name, samples=15 * 64 * 16, ppo=config)
+        train(run, environment=toy_env, on_iteration=rows.append)
+        seen[name] = np.mean([row["kl"] for row in rows[8:]])
+    print(seen)
+    assert 0.004 < seen["adaptive"] < 0.06
+    assert seen["fixed"] < 0.1 * seen["adaptive"]
+
+
+def test_paper_preset_is_the_papers_table():
+    assert (PAPER.learning_rate, PAPER.kl_band, PAPER.sigma) == (5e-4, None, 0.05)
+    assert (PAPER.clip_ratio, PAPER.gamma, PAPER.hidden) == (0.2, 0.99, (2048, 1024, 512))
+    assert PAPER.steps * 2048 / PAPER.minibatches == 1024
+
+
+def test_critic_warmup_leaves_the_actor_alone():
+    config = PPOConfig(hidden=(16,), steps=4, minibatches=2, epochs=2)
+    agent = PPO(3, 2, config, seed=1)
+    rollout, _ = filled_rollout(agent, 40, seed=2)
+    actor, critic = agent.actor.head.weight.clone(), agent.critic.head.weight.clone()
+    agent.actor_weight.fill_(0.0)
+    agent.update(rollout)
+    assert torch.equal(actor, agent.actor.head.weight)
+    assert not torch.equal(critic, agent.critic.head.weight)
+
+
+def test_too_few_samples_for_the_minibatches_is_said():
+    agent = PPO(2, 1, PPOConfig(hidden=(8,), steps=1, minibatches=8))
+    with pytest.raises(ValueError, match="minibatches"):
+        agent.new_rollout(4)
+
+
+def test_the_toy_really_follows_its_matrices():
+    env = Integrator(5)
+    env.reset()
+    before = env.x.double().numpy()
+    action = torch.full((5, 1, 1), 0.3)
+    result = env.step(action)
+    np.testing.assert_allclose(result.final_obs[:, 0].numpy(), before @ A.T + 0.3 * B.T, atol=1e-6)
