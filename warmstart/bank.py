@@ -1,0 +1,173 @@
+"""The clip library: frames from which training starts, and the demonstrations that are shipped.
+
+Clips are in the task's world already (a demonstration crosses the bar at x = 20), so a frame is a
+start as it is. Frames that would start inside the ground are left out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sports.env import Starts
+from sports.humanoid.body import load_body
+from sports.registry import task_names
+from warmstart.clip import Clip
+from warmstart.outcome import lowest
+
+DATA = "data"
+CONTEXT = {"high_jump": ("bar_height",)}
+"""Labels of a clip that its task understands as context of a start, by task."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """Which part of each clip serves as starts (s). Raises ValueError when it is empty."""
+
+    start: float = 0.0
+    """From this time after the clip's first frame."""
+    end: float | None = None
+    """Until this time; None for the end."""
+    before: str | None = None
+    """Until an event of the clip's metadata, e.g. ``takeoff``; clips without it keep all."""
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or (self.end is not None and self.end < self.start):
+            raise ValueError(f"a window from {self.start} s to {self.end} s is empty")
+
+    def rows(self, clip: Clip) -> np.ndarray:
+        """Indices of the clip's frames inside the window."""
+        end = clip.duration if self.end is None else self.end
+        if self.before is not None:
+            end = min(end, float(clip.meta.get("events", {}).get(self.before, end)))
+        inside = (clip.times >= self.start - 1e-9) & (clip.times <= end + 1e-9)
+        return np.flatnonzero(inside)
+
+
+class ClipBank:
+    """Clips of one body, as starts for reference-state initialisation.
+
+    Raises ValueError when there is no clip, or when their bodies differ.
+    """
+
+    def __init__(self, clips: Iterable[Clip]) -> None:
+        self.clips = tuple(clips)
+        if not self.clips:
+            raise ValueError("a clip bank needs at least one clip")
+        bodies = sorted({clip.body for clip in self.clips})
+        if len(bodies) > 1:
+            raise ValueError(f"the clips of a bank must be of one body, not of {bodies}")
+        self.body = bodies[0]
+
+    @property
+    def seconds(self) -> float:
+        """Total duration of the clips."""
+        return sum(clip.duration for clip in self.clips)
+
+    def starts(
+        self,
+        window: Window | None = None,
+        probability: float = 0.5,
+        context: Iterable[str] = (),
+        floor: float = 0.01,
+    ) -> Starts:
+        """Frames of all clips as start states, each with the labels of its clip.
+
+        ``context`` names labels besides those of the clips' tasks; a clip without one has NaN
+        there, which a task reads as "draw your own". Frames that reach more than ``floor`` (m)
+        below the ground are left out. Raises ValueError when no frame is left or a label is not
+        a number.
+        """
+        window = window or Window()
+        body = load_body(self.body)
+        names = list(context)
+        for clip in self.clips:
+            names += [n for n in CONTEXT.get(clip.meta.get("problem", ""), ()) if n not in names]
+        qpos, qvel, labels = [], [], []
+        for clip in self.clips:
+            rows = window.rows(clip)
+            rows = rows[lowest(body, clip.qpos[rows]) >= -floor] if rows.size else rows
+            qpos.append(clip.qpos[rows])
+            qvel.append(clip.qvel[rows])
+            labels.append(np.tile([label(clip, name) for name in names], (len(rows), 1)))
+        frames = np.concatenate(qpos)
+        if not len(frames):
+            raise ValueError(
+                f"no frame of {len(self.clips)} clips lies in the window and above the ground"
+            )
+
+        def tensor(rows: np.ndarray) -> torch.Tensor:
+            return torch.tensor(rows, dtype=torch.float32)
+
+        values = np.concatenate(labels)
+        return Starts(
+            qpos=tensor(frames),
+            qvel=tensor(np.concatenate(qvel)),
+            context={name: tensor(values[:, i]) for i, name in enumerate(names)},
+            probability=probability,
+        )
+
+
+def label(clip: Clip, name: str) -> float:
+    """The achieved value of a label, else the asked one, else NaN. Raises ValueError if it is not
+    a number."""
+    for key in ("achieved", "asked"):
+        values = clip.meta.get(key)
+        if isinstance(values, dict) and values.get(name) is not None:
+            value = values[name]
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ValueError(f"the label {name} of a clip is {value!r}, not a number")
+            return float(value)
+    return float("nan")
+
+
+def demonstration_files(problem: str | None = None) -> list[Path]:
+    """The shipped npz files, of one problem or of all, by name."""
+    folder = Path(str(resources.files("warmstart").joinpath(DATA)))
+    files = sorted(folder.glob("*.npz"))
+    return [f for f in files if problem is None or f.name.startswith(f"{problem}_")]
+
+
+def load_demonstrations(problem: str, strength: str | None = None) -> list[Clip]:
+    """Shipped demonstrations of a problem: certified, tracked in MuJoCo, labelled with what they
+    achieved. ``strength`` keeps those of one strength.
+
+    Raises ValueError for an unknown problem, or when none is shipped.
+    """
+    if problem not in task_names():
+        raise ValueError(f"unknown problem '{problem}'; known: {', '.join(task_names())}")
+    clips = [Clip.load(path) for path in demonstration_files(problem)]
+    clips = [c for c in clips if strength is None or c.meta.get("strength") == strength]
+    if not clips:
+        at = f" at strength '{strength}'" if strength else ""
+        raise ValueError(f"no demonstration of '{problem}'{at} is shipped; run `solve {problem}`")
+    return clips
+
+
+def list_demonstrations() -> list[dict[str, Any]]:
+    """One row per shipped demonstration, for ``list``: name, problem, asked, achieved, strength,
+    seconds and whether its certificate passed."""
+    rows = []
+    for path in demonstration_files():
+        clip = Clip.load(path)
+        certificate = path.with_suffix(".json")
+        passed = certificate.is_file() and json.loads(certificate.read_text())["passed"] is True
+        rows.append(
+            {
+                "name": path.stem,
+                "problem": clip.meta.get("problem"),
+                "asked": clip.meta.get("asked"),
+                "achieved": clip.meta.get("achieved"),
+                "strength": clip.meta.get("strength"),
+                "seconds": round(clip.duration, 3),
+                "certified": passed,
+            }
+        )
+    return rows

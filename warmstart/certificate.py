@@ -1,0 +1,489 @@
+"""Is an optimised motion true? A fail-closed gate with every figure listed.
+
+The optimiser says a motion is feasible at its knots, by its own equations. Here the motion between
+the knots is sampled five times finer and everything is computed again from other sources: inverse
+dynamics by MuJoCo's and by Drake's own algorithms on models built from the body table, geometry by
+MuJoCo's collision routines, contact from the links' own motion, and at last both engines replay
+the torques. What is missing, not finite or could not be computed fails.
+
+Between knots the motion is the one of :meth:`Solution.sample`: joint accelerations, torques and
+forces linear in time, so positions are cubics. That is what the trapezoid rule on accelerations
+integrates exactly. Full dynamics hold only at the knots; what is left between them is the residual
+listed here. Over the whole motion the residual acts like an unknown outside force, so the gate
+that the specification sets (2 % of body weight) is on its root mean square, which bounds the
+impulse it can give; its peak, always in the middle of one interval around a contact change, is
+listed too and may be five times as large.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+from sports.humanoid.body import Body, load_body
+from sports.humanoid.mjcf import body_name, build_model
+from sports.physics import PhysicsState, make_physics
+from sports.scene import Scene, humanoid_scene
+from warmstart.outcome import OUTCOMES, support
+from warmstart.solution import Solution
+
+FINER = 5
+"""Samples per interval of the optimiser."""
+GRAVITY = 9.81
+REPLAY_RATE = 480.0
+"""Control and simulation rate of the replays (Hz)."""
+LOADED = 0.01
+"""A contact point counts as loaded from this share of body weight on."""
+
+LIMITS: dict[str, tuple[str, float, str]] = {
+    "nlp violation": ("<=", 1e-5, "scaled"),
+    "velocity is the rate of position": ("<=", 1e-3, "m/s, rad/s"),
+    "acceleration is the rate of velocity": ("<=", 5e-2, "m/s^2, rad/s^2"),
+    "base force residual rms, mujoco": ("<=", 0.02, "body weight"),
+    "base force residual max, mujoco": ("<=", 0.10, "body weight"),
+    "base moment residual rms, mujoco": ("<=", 0.02, "body weight x m"),
+    "base moment residual max, mujoco": ("<=", 0.10, "body weight x m"),
+    "base force residual rms, drake": ("<=", 0.02, "body weight"),
+    "base force residual max, drake": ("<=", 0.10, "body weight"),
+    "base moment residual rms, drake": ("<=", 0.02, "body weight x m"),
+    "base moment residual max, drake": ("<=", 0.10, "body weight x m"),
+    "inverse dynamics, mujoco against drake": ("<=", 1e-6, "of the largest"),
+    "planned torque": ("<=", 1.0 + 1e-5, "of the limit"),
+    "needed torque, mujoco": ("<=", 1.02, "of the limit"),
+    "needed torque, drake": ("<=", 1.02, "of the limit"),
+    "friction": ("<=", 1e-3, "body weight"),
+    "pulling contact force": ("<=", 1e-3, "body weight"),
+    "height of loaded contacts": ("<=", 0.005, "m"),
+    "speed of loaded contacts": ("<=", 0.05, "m/s"),
+    "depth below the ground": ("<=", 0.005, "m"),
+    "depth of self-contact": ("<=", 0.02, "m"),
+    "beyond a joint limit": ("<=", 1e-6, "rad"),
+    "planned outcome": (">=", 0.0, "m"),
+    "replay in mujoco: outcome": ("recorded", math.nan, "m"),
+    "replay in drake: outcome": ("recorded", math.nan, "m"),
+    "replay in mujoco: root error": ("recorded", math.nan, "m"),
+    "replay in drake: root error": ("recorded", math.nan, "m"),
+}
+"""Every check of every problem: sense, limit, unit. A recorded figure must only exist."""
+PROBLEM_LIMITS: dict[str, dict[str, tuple[str, float, str]]] = {
+    "high_jump": {"clearance over the bar": (">=", 0.0, "m")},
+    "long_jump": {"foremost contact behind the line": (">=", 0.0, "m")},
+}
+
+
+@dataclass(frozen=True)
+class Check:
+    """One figure against its limit."""
+
+    name: str
+    value: float
+    """NaN where it could not be computed."""
+    sense: str
+    """``<=``, ``>=``, or ``recorded``: any finite figure passes."""
+    limit: float
+    unit: str
+    note: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the figure is finite and inside its limit."""
+        if not math.isfinite(self.value):
+            return False
+        if self.sense == "recorded":
+            return True
+        if not math.isfinite(self.limit) or self.sense not in ("<=", ">="):
+            return False
+        return self.value <= self.limit if self.sense == "<=" else self.value >= self.limit
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Every check of one motion, and the outcome that it achieves."""
+
+    problem: str
+    asked: dict[str, float]
+    strength: str
+    achieved: dict[str, float]
+    """``planned``, ``replay_mujoco``, ``replay_drake``: the outcome (m); 0 for a replay that made
+    no valid attempt (open loop, a jump may fall), missing if it could not be computed."""
+    checks: tuple[Check, ...]
+    stats: dict[str, Any]
+
+    @property
+    def required(self) -> dict[str, tuple[str, float, str]]:
+        """What a certificate of this problem must list."""
+        return LIMITS | PROBLEM_LIMITS.get(self.problem, {"problem is known": ("<=", 0.0, "")})
+
+    @property
+    def passed(self) -> bool:
+        """True only if every required check is listed with its limit and passes, and all others."""
+        listed = {(c.name, c.sense, c.unit) for c in self.checks if self._strict(c)}
+        wanted = {(name, sense, unit) for name, (sense, _, unit) in self.required.items()}
+        return wanted <= listed and all(c.passed for c in self.checks)
+
+    def _strict(self, check: Check) -> bool:
+        limit = self.required.get(check.name, (None, None, None))[1]
+        return check.sense == "recorded" or check.limit == limit
+
+    @property
+    def failures(self) -> list[str]:
+        """One sentence for each check that failed or is missing."""
+        out = [
+            f"{c.name} is {c.value:.4g} {c.unit}, must be {c.sense} {c.limit:.4g}"
+            + (f" ({c.note})" if c.note else "")
+            for c in self.checks
+            if not c.passed
+        ]
+        listed = {c.name for c in self.checks}
+        return out + [f"{name} is missing" for name in self.required if name not in listed]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON; figures that are not finite become null."""
+
+        def clean(x: Any) -> Any:
+            if isinstance(x, dict):
+                return {str(k): clean(v) for k, v in x.items()}
+            if isinstance(x, list | tuple):
+                return [clean(v) for v in x]
+            if isinstance(x, np.generic):
+                x = x.item()
+            return None if isinstance(x, float) and not math.isfinite(x) else x
+
+        return clean(
+            {
+                "format": "olympics-opt certificate 1",
+                "passed": self.passed,
+                "problem": self.problem,
+                "asked": self.asked,
+                "achieved": self.achieved,
+                "strength": self.strength,
+                "checks": [asdict(c) | {"passed": c.passed} for c in self.checks],
+                "stats": self.stats,
+            }
+        )
+
+    def to_json(self, path: str | Path) -> None:
+        """Writes ``certificate.json`` atomically."""
+        path = Path(path)
+        text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            temporary.write_text(text + "\n")
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    @staticmethod
+    def from_json(path: str | Path) -> Certificate:
+        """Reads a certificate; ``passed`` is computed anew, what the file says is not believed.
+
+        Raises ValueError naming the file.
+        """
+        try:
+            data = json.loads(Path(path).read_text())
+            checks = tuple(
+                Check(
+                    name=str(c["name"]),
+                    value=math.nan if c["value"] is None else float(c["value"]),
+                    sense=str(c["sense"]),
+                    limit=math.nan if c["limit"] is None else float(c["limit"]),
+                    unit=str(c["unit"]),
+                    note=str(c["note"]),
+                )
+                for c in data["checks"]
+            )
+            return Certificate(
+                problem=str(data["problem"]),
+                asked=dict(data["asked"]),
+                strength=str(data["strength"]),
+                achieved={k: float(v) for k, v in data["achieved"].items() if v is not None},
+                checks=checks,
+                stats=dict(data["stats"]),
+            )
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path} is not a readable certificate: {error}") from error
+
+
+def certify(solution: Solution) -> Certificate:
+    """Computes every check of a motion. Never raises for a bad motion: what breaks, fails."""
+    figures: dict[str, float] = {}
+    notes: dict[str, str] = {}
+    achieved: dict[str, float] = {}
+    groups: list[tuple[str, Callable[[], dict[str, float]]]] = [
+        ("nlp", lambda: {"nlp violation": float(solution.stats["max_violation"])}),
+        ("interpolation", lambda: _interpolation(solution)),
+        ("dynamics", lambda: _dynamics(solution, notes)),
+        ("contact", lambda: _contact(solution)),
+        ("geometry", lambda: _geometry(solution, notes)),
+        ("outcome", lambda: _outcome(solution, achieved)),
+        ("replay in mujoco", lambda: _replay(solution, "mujoco", achieved)),
+        ("replay in drake", lambda: _replay(solution, "drake", achieved)),
+    ]
+    broken = []
+    for name, compute in groups:
+        try:
+            figures |= compute()
+        except Exception as error:  # fail-closed: whatever goes wrong, the check is missing
+            broken.append(f"{name}: {type(error).__name__}: {error}")
+    required = LIMITS | PROBLEM_LIMITS.get(solution.problem, {"problem is known": ("<=", 0.0, "")})
+    checks = tuple(
+        Check(name, float(figures.get(name, math.nan)), sense, limit, unit, notes.get(name, ""))
+        for name, (sense, limit, unit) in required.items()
+    )
+    stats = {k: v for k, v in solution.stats.items() if isinstance(v, int | float | str | bool)}
+    return Certificate(
+        problem=solution.problem,
+        asked=dict(solution.asked),
+        strength=solution.strength,
+        achieved={k: v for k, v in achieved.items() if math.isfinite(v)},
+        checks=checks,
+        stats=stats | ({"not computed": broken} if broken else {}),
+    )
+
+
+def fine_times(solution: Solution) -> np.ndarray:
+    """Every knot and ``FINER - 1`` times inside each interval (s)."""
+    share = np.arange(FINER) / FINER
+    steps = np.diff(solution.times)[:, None]
+    return np.append((solution.times[:-1, None] + share * steps).ravel(), solution.times[-1])
+
+
+def _interpolation(solution: Solution) -> dict[str, float]:
+    """Finite differences of the sampled motion inside every interval."""
+    model = build_model(solution.body)
+    middle, e = 0.5 * (solution.times[1:] + solution.times[:-1]), 1e-5
+    before, at, after = (solution.sample(middle + d) for d in (-e, 0.0, e))
+    rate, worst = np.zeros(model.nv), 0.0
+    for k in range(len(middle)):
+        mujoco.mj_differentiatePos(model, rate, 2 * e, before["qpos"][k], after["qpos"][k])
+        worst = max(worst, float(np.abs(rate - at["qvel"][k]).max()))
+    acceleration = (after["qvel"] - before["qvel"]) / (2 * e)
+    return {
+        "velocity is the rate of position": worst,
+        "acceleration is the rate of velocity": float(np.abs(acceleration - at["qacc"]).max()),
+    }
+
+
+def _dynamics(solution: Solution, notes: dict[str, str]) -> dict[str, float]:
+    """Residual wrench on the root and servo torques needed, by both engines."""
+    motion = solution.sample(fine_times(solution))
+    weight = solution.body.mass * GRAVITY
+    effort = solution.body.array("effort")
+    needed = {
+        "mujoco": inverse_dynamics_mujoco(solution, motion),
+        "drake": inverse_dynamics_drake(solution, motion),
+    }
+    scale = np.abs(needed["mujoco"]).max()
+    difference = np.abs(needed["mujoco"] - needed["drake"]).max() / scale
+    out = {"inverse dynamics, mujoco against drake": float(difference)}
+    for engine, force in needed.items():
+        share = np.abs(force[:, 6:]) / effort
+        k, dof = np.unravel_index(int(np.argmax(share)), share.shape)
+        name = f"needed torque, {engine}"
+        out[name] = float(share.max())
+        notes[name] = f"{solution.body.dofs[dof].name} at {fine_times(solution)[k]:.3f} s"
+        for part, rows in (("force", slice(0, 3)), ("moment", slice(3, 6))):
+            residual = np.linalg.norm(force[:, rows], axis=1) / weight
+            duration = np.gradient(fine_times(solution))
+            mean_square = np.sum(residual**2 * duration) / np.sum(duration)
+            out[f"base {part} residual rms, {engine}"] = float(np.sqrt(mean_square))
+            name = f"base {part} residual max, {engine}"
+            out[name] = float(residual.max())
+            notes[name] = f"at {fine_times(solution)[int(residual.argmax())]:.3f} s"
+    share = np.abs(solution.torque) / effort
+    dof = int(share.max(0).argmax())
+    out["planned torque"] = float(share.max())
+    notes["planned torque"] = solution.body.dofs[dof].name
+    return out
+
+
+def inverse_dynamics_mujoco(solution: Solution, motion: dict[str, np.ndarray]) -> np.ndarray:
+    """(T, nv) forces needed besides gravity, damping and contact, by MuJoCo.
+
+    The first three act on the root in world axes (N), the next three are the moment about its
+    origin in the root's axes (N m); both are zero for a true motion. The rest are servo torques.
+    """
+    model = build_model(solution.body)
+    model.opt.disableflags |= int(
+        mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    )
+    data = mujoco.MjData(model)
+    links = [model.body(body_name(0, link)).id for link, _ in solution.contact_points]
+    out, jac = np.zeros((len(motion["qpos"]), model.nv)), np.zeros((3, model.nv))
+    for t in range(len(out)):
+        data.qpos[:], data.qvel[:] = motion["qpos"][t], motion["qvel"][t]
+        data.qacc[:] = motion["qacc"][t]
+        mujoco.mj_inverse(model, data)
+        out[t] = data.qfrc_inverse
+        for c, (_, point) in enumerate(solution.contact_points):
+            where = data.xpos[links[c]] + data.xmat[links[c]].reshape(3, 3) @ np.array(point)
+            mujoco.mj_jac(model, data, jac, None, where, links[c])
+            out[t] -= jac.T @ motion["contact_force"][t, c]
+    return out
+
+
+def inverse_dynamics_drake(solution: Solution, motion: dict[str, np.ndarray]) -> np.ndarray:
+    """(T, nv) the same as :func:`inverse_dynamics_mujoco`, by Drake, in MuJoCo's coordinates."""
+    from pydrake.multibody.math import SpatialForce
+    from pydrake.multibody.tree import MultibodyForces
+
+    from sports.humanoid.drake_plant import build_plant, rotate
+
+    built = build_plant(solution.body, time_step=0.0, ground=False)
+    plant, human = built.plant, built.humanoid
+    context = plant.CreateDefaultContext()
+    world = plant.world_frame()
+    points = [
+        (human.links[solution.body.link_index(link)], np.array(point))
+        for link, point in solution.contact_points
+    ]
+    quat = motion["qpos"][:, 3:7]
+    out = np.zeros((len(quat), 6 + solution.body.num_dofs))
+    q, v, a = (np.zeros(n) for n in (plant.num_positions(), *[plant.num_velocities()] * 2))
+    for t in range(len(out)):
+        q[human.q_index], v[human.v_index] = human.to_drake(motion["qpos"][t], motion["qvel"][t])
+        qacc = motion["qacc"][t]
+        spin_up = rotate(quat[t], qacc[3:6])  # d/dt (R w_B) = R d/dt w_B
+        a[human.v_index] = np.concatenate([spin_up, qacc[:3], qacc[6:]])
+        plant.SetPositions(context, q)
+        plant.SetVelocities(context, v)
+        forces = MultibodyForces(plant)
+        plant.CalcForceElementsContribution(context, forces)  # gravity and joint damping
+        for c, (link, point) in enumerate(points):
+            push = SpatialForce(tau=np.zeros(3), f=motion["contact_force"][t, c])
+            arm = link.body_frame().CalcRotationMatrixInWorld(context).matrix() @ point
+            link.AddInForce(context, arm, push, world, forces)
+        tau = plant.CalcInverseDynamics(context, a, forces)[human.v_index]
+        out[t] = human.velocity_map(quat[t]).T @ tau
+    return out
+
+
+def _contact(solution: Solution) -> dict[str, float]:
+    """Forces inside the friction cone, pushing only, at points that rest on the ground."""
+    motion = solution.sample(fine_times(solution))
+    scene = humanoid_scene(solution.body)
+    model = build_model(scene)
+    data = mujoco.MjData(model)
+    weight = solution.body.mass * GRAVITY
+    force = motion["contact_force"] / weight
+    tangent = np.linalg.norm(force[:, :, :2], axis=2)
+    loaded = np.linalg.norm(force, axis=2) > LOADED
+    links = [model.body(body_name(0, link)).id for link, _ in solution.contact_points]
+    height, speed, jac = 0.0, 0.0, np.zeros((3, model.nv))
+    for t in np.flatnonzero(loaded.any(1)):
+        data.qpos[:], data.qvel[:] = motion["qpos"][t], motion["qvel"][t]
+        mujoco.mj_forward(model, data)
+        for c in np.flatnonzero(loaded[t]):
+            point = np.array(solution.contact_points[c][1])
+            where = data.xpos[links[c]] + data.xmat[links[c]].reshape(3, 3) @ point
+            mujoco.mj_jac(model, data, jac, None, where, links[c])
+            height = max(height, abs(float(where[2])))
+            speed = max(speed, float(np.linalg.norm(jac @ data.qvel)))
+    return {
+        "friction": float((tangent - scene.ground_friction * force[:, :, 2]).max(initial=0.0)),
+        "pulling contact force": float((-force[:, :, 2]).max(initial=0.0)),
+        "height of loaded contacts": height,
+        "speed of loaded contacts": speed,
+    }
+
+
+def _geometry(solution: Solution, notes: dict[str, str]) -> dict[str, float]:
+    """Ground, self-contact and joint limits on the fine grid."""
+    times = fine_times(solution)
+    qpos = solution.sample(times)["qpos"]
+    points, radii = support(solution.body, qpos)
+    depth = float((radii - points[..., 2]).max())
+    model = build_model(solution.body)
+    data = mujoco.MjData(model)
+    own, pair = 0.0, ""
+    for t, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_fwdPosition(model, data)
+        for contact in data.contact:
+            a, b = (model.geom_bodyid[g] for g in contact.geom)
+            if 0 not in (a, b) and -contact.dist > own:
+                own = -float(contact.dist)
+                names = " and ".join(model.body(i).name.split("/")[-1] for i in (a, b))
+                pair = f"{names} at {times[t]:.3f} s"
+    notes["depth of self-contact"] = pair
+    hinges = qpos[:, 7:]
+    beyond = np.maximum(
+        hinges - solution.body.array("upper"), solution.body.array("lower") - hinges
+    )
+    return {
+        "depth below the ground": max(depth, 0.0),
+        "depth of self-contact": own,
+        "beyond a joint limit": max(float(beyond.max()), 0.0),
+    }
+
+
+def _outcome(solution: Solution, achieved: dict[str, float]) -> dict[str, float]:
+    outcome = OUTCOMES[solution.problem]
+    times = fine_times(solution)
+    motion = solution.sample(times)
+    achieved["planned"] = outcome.measure(solution.body, times, motion["qpos"])
+    return {
+        "planned outcome": achieved["planned"],
+        **outcome.rules(solution.body, times, motion["qpos"], solution.asked),
+    }
+
+
+def _replay(solution: Solution, engine: str, achieved: dict[str, float]) -> dict[str, float]:
+    times, qpos = replay(solution, engine)
+    outcome = OUTCOMES[solution.problem].measure(solution.body, times, qpos)
+    outcome = outcome if math.isfinite(outcome) else 0.0  # a failed attempt achieves nothing
+    achieved[f"replay_{engine}"] = outcome
+    inside = times <= solution.duration
+    planned = solution.sample(solution.times[0] + times[inside])["qpos"]
+    error = np.linalg.norm(qpos[inside, :3] - planned[:, :3], axis=1)
+    return {
+        f"replay in {engine}: outcome": outcome,
+        f"replay in {engine}: root error": float(error.max()),
+    }
+
+
+def replay(
+    solution: Solution, engine: str, hold: float = 0.5, scene: Scene | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Plays the torques open loop at ``REPLAY_RATE``: targets q + torque / kp, clipped by the
+    servo, then the last targets for ``hold`` s. The athlete is alone on the ground.
+
+    Returns times (T,) s from the first frame and qpos (T, 7 + n). Raises RuntimeError when the
+    simulation diverges.
+    """
+    scene = scene or humanoid_scene(solution.body, timestep=1.0 / REPLAY_RATE, substeps=1)
+    physics = make_physics(engine, scene, 1)
+    planned = math.floor(solution.duration * REPLAY_RATE)
+    steps = planned + round(hold * REPLAY_RATE)
+    middle = np.minimum((np.arange(steps) + 0.5) / REPLAY_RATE, solution.duration)
+    motion = solution.sample(solution.times[0] + middle)
+    targets = motion["qpos"][:, 7:] + motion["torque"] / solution.body.array("kp")
+    state = PhysicsState(
+        torch.tensor(solution.qpos[:1], dtype=torch.float32),
+        torch.tensor(solution.qvel[:1], dtype=torch.float32),
+        torch.zeros(1, 0, 3),
+    )
+    physics.reset(torch.ones(1, dtype=torch.bool), state)
+    out = [physics.qpos[0].double().numpy().copy()]
+    for target in targets:
+        physics.step(torch.tensor(target[None], dtype=torch.float32))
+        if bool(physics.bad.any()):
+            raise RuntimeError(f"the replay diverged in {engine} after {len(out)} steps")
+        out.append(physics.qpos[0].double().numpy().copy())
+    physics.close()
+    return np.arange(len(out)) / REPLAY_RATE, np.array(out)
+
+
+def athlete(name: str, strength: str) -> Body:
+    """The body of a certificate. Raises ValueError for an unknown name or strength."""
+    return load_body(name, strength=strength)  # type: ignore[arg-type]

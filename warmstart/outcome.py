@@ -1,0 +1,185 @@
+"""What a motion achieved, measured on its geometry: no optimiser and no engine is asked.
+
+The same functions measure a planned motion, its replays and tracked clips, from frames alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import torch
+
+from sports import high_jump, long_jump
+from sports.humanoid.body import Body
+from sports.humanoid.mjcf import build_model
+from sports.physics.base import Geometry
+from warmstart import rotation
+
+TOUCH = 0.005
+"""A support point this close to the ground (m) touches it: twice the sink of a landing foot."""
+FLIGHT = 0.005
+"""Without a support point below this height (m) the athlete flies."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one problem's outcome is measured and ruled."""
+
+    field: str
+    """Key in ``Solution.asked`` and name of the outcome (m)."""
+    measure: Callable[[Body, np.ndarray, np.ndarray], float]
+    """(body, times (T,), qpos (T, 7 + n)) -> outcome (m); NaN without a legal attempt."""
+    rules: Callable[[Body, np.ndarray, np.ndarray, dict[str, float]], dict[str, float]]
+    """(body, times, qpos, asked) -> figures of the problem's own checks."""
+
+
+def link_poses(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(T, B, 3) positions and (T, B, 4) attitudes of the links, by forward kinematics."""
+    joints = rotation.from_hinges(qpos[:, 7:].reshape(len(qpos), -1, 3))
+    pos = np.zeros((len(qpos), body.num_links, 3))
+    quat = np.zeros((len(qpos), body.num_links, 4))
+    hinged = 0
+    for i, parent in enumerate(body.parents()):
+        if parent < 0:
+            pos[:, i], quat[:, i] = qpos[:, :3], qpos[:, 3:7]
+            continue
+        offset = np.broadcast_to(np.array(body.links[i].offset), (len(qpos), 3))
+        pos[:, i] = pos[:, parent] + rotation.rotate(quat[:, parent], offset)
+        quat[:, i] = rotation.multiply(quat[:, parent], joints[:, hinged])
+        hinged += 1
+    return pos, quat
+
+
+def support(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(T, K, 3) support points of all links in the world and their radii (K,), m."""
+    pos, quat = (torch.from_numpy(x) for x in link_poses(body, qpos))
+    geometry = Geometry(body, "cpu")
+    geometry.points = geometry.points.double()
+    return geometry.world_points(pos, quat).numpy(), geometry.radii.double().numpy()
+
+
+def lowest(body: Body, qpos: np.ndarray) -> np.ndarray:
+    """(T,) height of the lowest point of the athlete (m)."""
+    points, radii = support(body, qpos)
+    return (points[..., 2] - radii).min(1)
+
+
+class _Bar:
+    """Distance between the athlete and a bar of any height, by MuJoCo's collision routines."""
+
+    def __init__(self, body: Body) -> None:
+        scene = high_jump.scene(high_jump.HighJump(bar_height=1.0), body)
+        self.model = build_model(scene)
+        self.data = mujoco.MjData(self.model)
+        self.at = scene.object_qpos("bar").start
+        self.data.qpos[:] = scene.default_qpos()
+        self.agent = scene.agent_qpos(0)
+        root = self.model.body(f"agent0/{body.links[0].name}").id
+        mine = self.model.body_rootid[self.model.geom_bodyid] == root
+        self.geoms = np.flatnonzero(mine)
+        self.bar = int(self.model.body("bar").geomadr[0])
+
+    def gap(self, qpos: np.ndarray, height: float, enough: float = 1.0) -> float:
+        """Smallest signed distance (m) of any frame to a bar whose top is at ``height``; at most
+        ``enough``."""
+        self.data.qpos[self.at : self.at + 3] = (
+            high_jump.BAR_X,
+            high_jump.BAR_Y,
+            height - high_jump.BAR_RADIUS,
+        )
+        best = enough
+        for row in qpos:
+            self.data.qpos[self.agent] = row
+            mujoco.mj_kinematics(self.model, self.data)
+            for geom in self.geoms:
+                found = mujoco.mj_geomDistance(
+                    self.model, self.data, int(geom), self.bar, best, None
+                )
+                best = min(best, found)
+        return best
+
+
+def cleared_height(body: Body, times: np.ndarray, qpos: np.ndarray) -> float:
+    """Top (m, to 2 mm) of the highest bar over x = 20 that the motion clears without touching.
+
+    NaN when the athlete does not cross the bar's plane between the uprights.
+    """
+    x = qpos[:, 0]
+    crossing = np.flatnonzero((x[:-1] < high_jump.BAR_X) & (x[1:] >= high_jump.BAR_X))
+    if not crossing.size or abs(qpos[crossing[0], 1] - high_jump.BAR_Y) > high_jump.HALF_GAP:
+        return float("nan")
+    near = qpos[np.abs(x - high_jump.BAR_X) < 1.5]
+    bar, low, high = _Bar(body), 0.1, None
+    for height in np.arange(low, 3.2, 0.15):
+        if bar.gap(near, float(height), 0.05) < 0.0:
+            high = float(height)
+            break
+        low = float(height)
+    if high is None or high <= 0.1:
+        return float("nan")
+    while high - low > 0.002:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if bar.gap(near, middle, 0.05) < 0.0 else (middle, high)
+    return low
+
+
+def _bar_rules(
+    body: Body, times: np.ndarray, qpos: np.ndarray, asked: dict[str, float]
+) -> dict[str, float]:
+    """Smallest distance to the bar that was asked for; the root must pass over it."""
+    height = asked["bar_height"]
+    x, z = qpos[:, 0], qpos[:, 2]
+    over = np.abs(x - high_jump.BAR_X) < 0.05
+    if x[0] > high_jump.BAR_X or x[-1] < high_jump.BAR_X or not over.any():
+        return {}
+    if z[over].min() < height:
+        return {}
+    return {"clearance over the bar": _Bar(body).gap(qpos, height, 0.5)}
+
+
+def _flight(body: Body, times: np.ndarray, qpos: np.ndarray) -> tuple[int, int] | None:
+    """First frame of the longest flight and first frame after it; None without one."""
+    flying = lowest(body, qpos) > FLIGHT
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flying, [False]]).astype(int)))
+    runs = [(a, b) for a, b in edges.reshape(-1, 2) if times[min(b, len(times) - 1)] > times[a]]
+    return max(runs, key=lambda r: times[min(r[1], len(times) - 1)] - times[r[0]], default=None)
+
+
+def jump_length(body: Body, times: np.ndarray, qpos: np.ndarray) -> float:
+    """Smallest x (m) of a ground contact within 0.3 s of the landing, minus the line at 20.
+
+    NaN without a flight, without a landing, or after a foul.
+    """
+    flight = _flight(body, times, qpos)
+    if flight is None or flight[1] >= len(qpos):
+        return float("nan")
+    points, radii = support(body, qpos)
+    touch = points[..., 2] - radii < TOUCH
+    x = points[..., 0]
+    if np.where(touch[: flight[0]], x[: flight[0]], -np.inf).max() >= long_jump.LINE_X:
+        return float("nan")
+    end = times[flight[1]] + long_jump.MARK_STEPS / 30.0
+    rows = (np.arange(len(times)) >= flight[1]) & (times <= end + 1e-9)
+    return float(np.where(touch[rows], x[rows], np.inf).min()) - long_jump.LINE_X
+
+
+def _line_rules(
+    body: Body, times: np.ndarray, qpos: np.ndarray, asked: dict[str, float]
+) -> dict[str, float]:
+    """How far behind the line the foremost contact before the flight is."""
+    flight = _flight(body, times, qpos)
+    if flight is None or flight[0] == 0:
+        return {}
+    points, radii = support(body, qpos[: flight[0]])
+    touch = points[..., 2] - radii < TOUCH
+    front = np.where(touch, points[..., 0], -np.inf).max()
+    return {"foremost contact behind the line": long_jump.LINE_X - float(front)}
+
+
+OUTCOMES: dict[str, Outcome] = {
+    "high_jump": Outcome("bar_height", cleared_height, _bar_rules),
+    "long_jump": Outcome("length", jump_length, _line_rules),
+}
