@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from sports.humanoid import smpl_pickle
 from sports.humanoid.body import load_body
+from sports.humanoid.mjcf import build_model
 from sports.humanoid.smpl_file import JOINT_LINKS, from_smpl, read_smpl
 
 TO_SMPL = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
@@ -125,6 +126,53 @@ def test_shapes_keep_the_volume_of_the_skin_and_the_density_of_the_table(npz):
             np.testing.assert_allclose(shape.end, row.shapes[0].end, atol=2e-4)
 
 
+def skin_of(shape, rng):
+    """Points on the surface of a shape (n, 3): enough that their hull nearly fills it."""
+    if shape.kind == "box":
+        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        return np.asarray(shape.center) + corners * np.asarray(shape.size)
+    ball = rng.normal(size=(600, 3))
+    ball *= shape.size[0] / np.linalg.norm(ball, axis=1, keepdims=True)
+    axis = np.subtract(shape.end, shape.center)
+    return np.where((ball @ axis > 0)[:, None], shape.end, shape.center) + ball
+
+
+@pytest.mark.parametrize("family", ["smpl", "smplx"])
+def test_a_file_whose_skin_is_the_packaged_body_gives_it_back(tmp_path, family):
+    table, names, rng = load_body(family), JOINT_LINKS[family], np.random.default_rng(0)
+    joints = joint_positions(family)
+    skins = [
+        joints[i] + skin_of(table.links[table.link_index(name)].shapes[0], rng)
+        for i, name in enumerate(names)
+    ]
+    owner = np.repeat(np.arange(len(names)), [len(skin) for skin in skins])
+    ours = np.concatenate(skins)
+    regressor = np.zeros((len(names), len(ours)))
+    for i, skin in enumerate(skins):  # weights that sum to one and mean to the joint
+        system = np.vstack([np.ones(len(skin)), (skin - joints[i]).T])
+        regressor[i, owner == i] = np.linalg.lstsq(system, np.eye(4)[0], rcond=None)[0]
+    fields = model_fields(family) | {
+        "v_template": ours @ TO_SMPL.T,
+        "shapedirs": np.zeros((len(ours), 3, 10)),
+        "J_regressor": regressor,
+        "weights": np.eye(len(names))[owner],
+    }
+    body = from_smpl(write_npz(tmp_path / "table.npz", fields))
+    for link, row in zip(body.links, table.links, strict=True):
+        (found,), (wanted,) = link.shapes, row.shapes
+        np.testing.assert_allclose(link.offset, row.offset, atol=1e-9)
+        if wanted.kind == "box":
+            np.testing.assert_allclose(found.center, wanted.center, atol=1e-9)
+            np.testing.assert_allclose(found.size, wanted.size, atol=1e-9)
+        else:  # a hull of 600 points lacks 2 % of a capsule; a fingertip ends where its skin does
+            assert found.mass == pytest.approx(wanted.mass, rel=0.15 if "3" in row.name else 0.04)
+            assert found.size[0] == pytest.approx(
+                wanted.size[0], rel=0.1 if "3" in row.name else 0.03
+            )
+    assert body.mass == pytest.approx(table.mass, rel=0.02)
+    assert body.standing_height() == pytest.approx(table.standing_height(), abs=1e-9)
+
+
 def test_first_coefficient_scales_everything(npz):
     mean = from_smpl(npz)
     for beta in (-2.0, 0.5, 3.0):
@@ -143,6 +191,13 @@ def test_second_coefficient_stretches_one_shank_linearly(npz):
         moved = np.subtract(after.offset, before.offset)
         expected = [0, 0, -2 * SHANK_STRETCH] if after.name == "L_Ankle" else [0, 0, 0]
         np.testing.assert_allclose(moved, expected, atol=1e-12)
+
+
+def test_mujoco_builds_the_body(npz):
+    body = from_smpl(npz, [1.0, 2.0])
+    model = build_model(body)
+    assert model.nu == body.num_dofs
+    assert model.body_mass.sum() == pytest.approx(body.mass)
 
 
 def test_strength_limits_and_equipment_as_in_a_packaged_body(npz):
