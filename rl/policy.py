@@ -66,6 +66,7 @@ class Policy:
     extra: dict[str, Tensor] = field(default_factory=dict)
     """Critic state, where the source has it (a run's folder)."""
     _random: torch.Generator | None = None
+    _noise_seed: int = 0
 
     @torch.no_grad()
     def __call__(self, obs: Tensor) -> Tensor:
@@ -75,7 +76,7 @@ class Policy:
             if self.metadata["algo"] == "zero":
                 return torch.zeros(shape, device=obs.device)
             if self._random is None or self._random.device != obs.device:
-                self._random = torch.Generator(obs.device).manual_seed(0)
+                self._random = torch.Generator(obs.device).manual_seed(self._noise_seed)
             return 2.0 * torch.rand(shape, device=obs.device, generator=self._random) - 1.0
         clip = self.metadata["observation_clip"]
         return self.actor(((torch.nan_to_num(obs) - self.mean) / self.std).clamp(-clip, clip))
@@ -86,6 +87,10 @@ class Policy:
             self.actor.to(device)
         self.mean, self.std = self.mean.to(device), self.std.to(device)
         return self
+
+    def seed(self, seed: int) -> None:
+        """Starts the noise of the ``random`` baseline anew."""
+        self._noise_seed, self._random = seed, None
 
     def check(self, env: Any) -> None:
         """Raises PolicyError where the policy does not fit an environment."""
