@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -101,27 +100,9 @@ def _pretrained() -> list[dict[str, Any]]:
 
 
 def _demonstrations() -> list[dict[str, Any]]:
-    """Clips that come with the package, with what they were asked for and what they achieved."""
-    from importlib import resources
+    from warmstart.bank import list_demonstrations
 
-    from warmstart.clip import Clip
-
-    folder = Path(str(resources.files("warmstart"))) / "data"
-    rows = []
-    for path in sorted(folder.rglob("*.npz")):
-        clip = Clip.load(path)
-        rows.append(
-            {
-                "name": path.stem,
-                "problem": clip.meta.get("problem"),
-                "strength": clip.meta.get("strength"),
-                "asked": clip.meta.get("asked"),
-                "achieved": clip.meta.get("achieved"),
-                "seconds": round(clip.duration, 2),
-                "path": str(path),
-            }
-        )
-    return rows
+    return list_demonstrations()
 
 
 def _cell(value: Any) -> str:

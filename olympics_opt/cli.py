@@ -112,6 +112,37 @@ class Verify:
 
 
 @dataclass(frozen=True)
+class Render:
+    """Draw a policy: a video of its best episode, or a sheet of 12 frames of best and median.
+
+    The sheet needs no GL library; the video needs EGL or OSMesa unless ``--renderer software``.
+    """
+
+    name: Positional[Annotated[str, arg(metavar="TASK")]]
+    """Sport; see ``olympics-opt list``."""
+    policy: str
+    """A run folder, a policy file, or ``pretrained[:ALGO[-STRENGTH]]``."""
+    out: Path | None = None
+    """mp4 file for the video."""
+    sheet: Path | None = None
+    """png file for the sheet."""
+    renderer: Literal["gl", "software"] = "gl"
+    """``gl`` is MuJoCo's renderer; ``software`` needs no library and is slower."""
+    engine: Literal["mujoco", "warp", "drake"] = "mujoco"
+    """Physics engine."""
+    trials: int = 20
+    """Episodes from which the best and the median are taken."""
+    seed: int = 0
+    """Seed of all randomness."""
+    processes: int = 2
+    """Worker processes for the ``drake`` engine."""
+    strength: Literal["paper", "human"] | None = None
+    """Strength of the athlete; by default the one the policy was trained with."""
+    limits: Literal["paper", "anatomical"] | None = None
+    """Joint ranges; by default those the policy was trained with."""
+
+
+@dataclass(frozen=True)
 class Study:
     """The whole line on one sport, from optimisation to a verified policy and a report.
 
@@ -122,6 +153,8 @@ class Study:
     """Sport with an optimisation problem and a trained policy; see ``olympics-opt list``."""
     out: Path
     """Folder for all stages and report.html."""
+    policy: str = "pretrained"
+    """Policy to fine-tune and to compare with."""
     minutes: float = 4.0
     """Training time on this machine."""
     worlds: int = 64
@@ -165,12 +198,12 @@ class Command:
 COMMANDS: dict[str, Command] = {
     "list": Command(List, "olympics_opt.catalogue:run_list"),
     "solve": Command(Solve, "olympics_opt.solve:run_solve", "problem"),
-    "train": Command(None, "rl.train:main", summary="Train a policy (PPO), on the CPU or on GPUs."),
+    "train": Command(
+        None, "olympics_opt.play:run_train", summary="Train a policy, on the CPU or on GPUs."
+    ),
     "evaluate": Command(Evaluate, "olympics_opt.play:run_evaluate", "task"),
     "verify": Command(Verify, "olympics_opt.verify:run_verify", "task"),
-    "render": Command(
-        None, "olympics_opt.render:main", summary="Video, or a sheet of 12 frames, of a policy."
-    ),
+    "render": Command(Render, "olympics_opt.play:run_render", "task"),
     "study": Command(Study, "olympics_opt.study:run_study"),
     "bench": Command(
         None, "olympics_opt.bench:main", summary="Measure physics, environment and training speed."

@@ -6,19 +6,18 @@ it in MuJoCo with feedback. Only what passed is written as a demonstration.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olympics_opt import atomic
 from olympics_opt.progress import progress
 
 if TYPE_CHECKING:
     from olympics_opt.cli import Solve
     from olympics_opt.report.page import Plots, Section, Tiles
     from warmstart.certificate import Certificate
+    from warmstart.clip import Clip
     from warmstart.solution import Solution
     from warmstart.tracking import Tracked
 
@@ -77,17 +76,10 @@ def certify_solution(solution: Solution, out: Path) -> Certificate:
 
     with progress("certifying in Drake and MuJoCo") as bar:
         certificate = certify(solution)
-        facts = certificate_json(certificate)
-        passed = sum(bool(c["passed"]) for c in facts["checks"])
-        bar.finish(f"{passed} of {len(facts['checks'])} checks passed")
-    atomic.write_json(out / CERTIFICATE, facts)
+        passed = sum(c.passed for c in certificate.checks)
+        bar.finish(f"{passed} of {len(certificate.checks)} checks passed")
+    certificate.to_json(out / CERTIFICATE)
     return certificate
-
-
-def certificate_json(certificate: Certificate) -> dict[str, Any]:
-    """A certificate as plain JSON values."""
-    value = certificate.to_json()
-    return json.loads(value) if isinstance(value, str) else value
 
 
 def track_clip(solution: Solution, out: Path, seed: int = 0) -> Tracked:
@@ -112,20 +104,18 @@ def write_preview(
     from olympics_opt.report import sections
     from olympics_opt.report.page import Page, Section, write_page
     from rl import provenance
+    from warmstart.problems import get_problem
 
-    facts = certificate_json(certificate)
-    blocks = [
-        sections.asked_achieved_tiles(
-            solution.asked, facts.get("achieved") or {}, "replayed by the certificate"
-        ),
-        *([tracking_tiles(tracked)] if tracked is not None else []),
-        solution_plots(solution),
-    ]
+    unit = get_problem(solution.problem).unit
+    facts = certificate.to_dict()
+    tiles = sections.asked_achieved_tiles(solution.asked, certificate.achieved, unit)
+    blocks = [tiles, *([tracking_tiles(tracked)] if tracked is not None else [])]
     page = Page(
         f"{solution.problem.replace('_', ' ').capitalize()}: an optimised motion",
         [
             Section("Asked and achieved", blocks),
-            motion_replay(solution, tracked),
+            motion_replay(solution, tracked.clip if tracked is not None else None),
+            Section("The motion over time", [solution_plots(solution)]),
             sections.certificate_section(facts),
             sections.provenance_section(
                 {
@@ -210,8 +200,8 @@ def solution_plots(solution: Solution) -> Plots:
 _LEG = ("Hip", "Knee", "Ankle", "Toe")
 
 
-def motion_replay(solution: Solution, tracked: Tracked | None) -> Section:
-    """The 3-D replay of an optimised and of a tracked motion."""
+def motion_replay(solution: Solution, tracked: Clip | None) -> Section:
+    """The 3-D replay of an optimised motion and of what MuJoCo made of it."""
     from olympics_opt.report.page import Fragment, Section
     from olympics_opt.report.replay import ReplayTrack, replay_html
     from warmstart.clip import clip_from_solution
@@ -220,7 +210,7 @@ def motion_replay(solution: Solution, tracked: Tracked | None) -> Section:
     clip = clip_from_solution(solution, 60.0)
     tracks = [ReplayTrack.from_clip(clip, "optimised")]
     if tracked is not None:
-        tracks.append(ReplayTrack.from_clip(tracked.clip, "tracked in MuJoCo"))
+        tracks.append(ReplayTrack.from_clip(tracked, "tracked in MuJoCo"))
     title = f"{solution.problem.replace('_', ' ')}, optimised motion"
     fragment = replay_html(scene_of(clip), tracks, title=title, element_id="replay-solution")
     return Section("Replay", [Fragment(fragment)])
@@ -231,19 +221,13 @@ def _print_outcome(
 ) -> None:
     from olympics_opt.report.page import number
 
-    facts = certificate_json(certificate)
-    for check in facts["checks"]:
-        mark = "passed" if check["passed"] else "FAILED"
-        unit = check.get("unit", "")
-        print(
-            f"  {mark}  {check['name']:<44} {number(check['value']):>10} {unit} "
-            f"(limit {number(check['limit'])})"
-        )
+    for c in certificate.checks:
+        limit = "recorded" if c.sense == "recorded" else f"{c.sense} {number(c.limit)}"
+        mark = "passed" if c.passed else "FAILED"
+        print(f"  {mark}  {c.name:<40}{number(c.value):>11} {c.unit} ({limit})")
     asked = ", ".join(f"{k} {number(v)}" for k, v in solution.asked.items())
-    achieved = ", ".join(
-        f"{k} {number(v)}" for k, v in (facts.get("achieved") or {}).items() if np.isscalar(v)
-    )
-    print(f"asked {asked}; achieved {achieved or 'nothing'}")
+    achieved = ", ".join(f"{k} {number(v)}" for k, v in certificate.achieved.items())
+    print(f"asked: {asked}; achieved: {achieved or 'nothing'}")
     if tracked is not None:
         print(
             f"tracked in MuJoCo: links {100 * tracked.link_error:.1f} cm off, "
@@ -254,8 +238,39 @@ def _print_outcome(
     if certificate.passed:
         print(f"wrote {out / DEMO}, {out / CERTIFICATE} and {out / PREVIEW}")
     else:
-        print(f"not certified: no demonstration is written; see {out / PREVIEW}")
+        print(f"not certified, so no demonstration is written: {'; '.join(certificate.failures)}")
 
 
 def _run_sweep(config: Solve, options: dict[str, Any]) -> int:
-    raise NotImplementedError
+    """Solves for several values in parallel; 0 when at least one of them is certified."""
+    from warmstart.problems import get_problem
+    from warmstart.sweep import sweep
+
+    assert config.sweep is not None
+    field, values = sweep_values(config.sweep)
+    if field in options:
+        raise ValueError(f"'{field}' is swept, so it cannot be set to {options[field]} as well")
+    results = sweep(
+        get_problem(config.name).name,
+        field,
+        values,
+        config.out,
+        processes=config.processes,
+        options=options,
+    )
+    good = sum(r.status == "certified" for r in results)
+    print(f"{good} of {len(results)} values certified; see {config.out / 'sweep.json'}")
+    return 0 if good else 1
+
+
+def sweep_values(text: str) -> tuple[str, list[float]]:
+    """``bar-height=0.8:1.5:8`` -> field and values. Raises ValueError for any other form."""
+    name, _, numbers = text.partition("=")
+    try:
+        low, high, count = numbers.split(":")
+        values = np.linspace(float(low), float(high), int(count))
+    except ValueError:
+        raise ValueError(
+            f"a sweep is NAME=FIRST:LAST:COUNT, such as bar-height=0.8:1.5:8, not '{text}'"
+        ) from None
+    return name.strip().replace("-", "_"), [round(float(v), 9) for v in values]

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from olympics_opt import atomic
 
 if TYPE_CHECKING:
     from olympics_opt.cli import Verify
-    from rl.evaluate import EvaluationResult
 
 KEEP = 0.9
 """Share of MuJoCo's success that must remain in Drake."""
@@ -171,3 +169,134 @@ def parity_rows(task: str, strength: str, limits: str) -> list[dict[str, Any]]:
     rows = parity_table(body)
     print(format_table(rows), flush=True)
     return [{**dataclasses.asdict(row), "ok": row.ok} for row in rows]
+
+
+def run_verify(config: Verify) -> int:
+    """The command: 0 when the result holds, 1 when it does not."""
+    from olympics_opt.cli import chosen_options
+    from olympics_opt.report.page import Page, write_page
+    from olympics_opt.report.verification import verification_sections
+
+    report, recordings = verify(
+        config.name,
+        config.policy,
+        trials=config.trials,
+        seed=config.seed,
+        strength=config.strength,
+        limits=config.limits,
+        options=chosen_options(config, "task"),
+        processes=config.processes,
+    )
+    atomic.write_json(config.out / "report.json", report)
+    page = Page(
+        f"{config.name.replace('_', ' ').capitalize()}: does the result hold in Drake?",
+        verification_sections(report, recordings),
+        f"The policy {config.policy} in MuJoCo, in MuJoCo at half the time step, and in Drake.",
+    )
+    path = write_page(page, config.out / "report.html")
+    print(verdict_text(report))
+    print(f"wrote {path} and {config.out / 'report.json'}")
+    return 0 if report["verdict"]["passed"] else 1
+
+
+def verify(
+    task: str,
+    policy: str,
+    *,
+    trials: int,
+    seed: int = 0,
+    strength: str | None = None,
+    limits: str | None = None,
+    options: dict[str, Any] | None = None,
+    processes: int = 2,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Parity table first, then the same trials in the three runs.
+
+    Returns the report as JSON values and one recording per run (the median episode). Stops after
+    the parity table when the two models differ. Raises ValueError for an unknown task or option,
+    PolicyError for a policy that cannot be used, RuntimeError where Drake is missing.
+    """
+    from olympics_opt.play import athlete, play
+    from rl import provenance
+
+    strength, limits = athlete(policy, task, strength, limits)
+    parity = parity_rows(task, strength, limits)
+    report: dict[str, Any] = {
+        "task": task,
+        "policy": policy,
+        "strength": strength,
+        "limits": limits,
+        "options": options or {},
+        "trials": trials,
+        "seed": seed,
+        "commit": provenance.commit(),
+        "versions": provenance.versions(),
+        "hardware": provenance.hardware(),
+        "parity": parity,
+        "results": {},
+        "samples": {},
+    }
+    if not all(row["ok"] for row in parity):
+        verdict = Verdict(False, ("the MuJoCo and the Drake model differ (parity table)",))
+        return {**report, "verdict": dataclasses.asdict(verdict)}, {}
+    recordings = {}
+    for run in RUNS:
+        played = play(
+            task,
+            policy,
+            engine="drake" if run == "drake" else "mujoco",
+            trials=trials,
+            seed=seed,
+            strength=strength,
+            limits=limits,
+            options=options,
+            timestep_divisor=2 if run == "mujoco-half-step" else 1,
+            processes=processes,
+            record=True,
+            label=run,
+        )
+        report["results"][run] = played.result
+        report["samples"][run] = {k: np.asarray(v).tolist() for k, v in played.trials.items()}
+        recordings[run] = played.median
+    return {**report, **compare(report["results"], report["samples"])}, recordings
+
+
+def compare(
+    results: Mapping[str, Mapping[str, Any]], samples: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Success differences, metric comparisons and the verdict of three runs, as JSON values.
+
+    ``results`` are results of the schema by run, ``samples`` run -> metric -> (trials,) values.
+    """
+    reference = {k: np.asarray(v, dtype=float) for k, v in samples["mujoco"].items()}
+    success, metrics = {}, {}
+    for run in RUNS[1:]:
+        other = {k: np.asarray(v, dtype=float) for k, v in samples[run].items()}
+        difference = success_difference(reference["success"], other["success"])
+        success[run] = {**dataclasses.asdict(difference), "difference": difference.difference}
+        pairs = [
+            compare_metric(name, reference[name], other[name])
+            for name in reference
+            if name != "success" and name in other
+        ]
+        metrics[run] = [dataclasses.asdict(p) for p in pairs if p is not None]
+    rates = {run: float(np.mean(np.asarray(samples[run]["success"]) > 0.5)) for run in RUNS}
+    bad = {
+        run: int(results[run].get("overflow") or 0) + int(results[run].get("nan_worlds") or 0)
+        for run in RUNS
+    }
+    return {
+        "success": success,
+        "comparisons": metrics,
+        "verdict": dataclasses.asdict(judge(rates, bad, parity_ok=True)),
+    }
+
+
+def verdict_text(report: Mapping[str, Any]) -> str:
+    """The verdict in a sentence or two."""
+    verdict = report["verdict"]
+    kept = verdict.get("kept")
+    start = "The result holds" if verdict["passed"] else "The result does not hold"
+    figure = f": Drake keeps {kept:.0%} of MuJoCo's success" if kept is not None else ""
+    rest = [*verdict["reasons"], *verdict["notes"]]
+    return f"{start}{figure}." + "".join(f" {text[0].upper()}{text[1:]}." for text in rest)

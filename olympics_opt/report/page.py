@@ -176,7 +176,9 @@ def number(value: object) -> str:
         if value != value:
             return "–"
         size = abs(value)
-        if size and (size >= 1e6 or size < 1e-3):
+        if size == 0:
+            return "0"
+        if size >= 1e6 or size < 1e-3:
             return f"{value:.2e}"
         return f"{value:.0f}" if size >= 1e4 else f"{value:.4g}"
     return str(value)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from olympics_opt.report.page import Plots, Section, Table, Text, Tile, Tiles, number
+from olympics_opt.report.page import Plots, Section, Table, Text, Tile, Tiles, Tone, number
 from olympics_opt.report.plots import Plot, Series, ecdf
 
 GRAVITY = 9.81
@@ -46,12 +46,14 @@ def metric_table(results: Mapping[str, Mapping[str, Any]], caption: str = "") ->
 
 
 def asked_achieved_tiles(
-    asked: Mapping[str, Any], achieved: Mapping[str, Any], detail: str = ""
+    asked: Mapping[str, Any], achieved: Mapping[str, Any], unit: str = ""
 ) -> Tiles:
-    """Tiles of the outcome that was prescribed and of the outcome that a check measured."""
-    tiles = [Tile(f"asked: {_words(k)}", number(v)) for k, v in asked.items() if _scalar(v)]
-    tiles += [
-        Tile(f"achieved: {_words(k)}", number(v), detail) for k, v in achieved.items() if _scalar(v)
+    """Tiles of the prescribed outcome and of what was measured, all in ``unit``."""
+    tiles = [
+        Tile(f"{word}: {_words(k)}", f"{number(v)} {unit}".strip())
+        for word, values in (("asked", asked), ("achieved", achieved))
+        for k, v in values.items()
+        if _scalar(v)
     ]
     return Tiles(tiles)
 
@@ -69,11 +71,11 @@ def certificate_section(certificate: Mapping[str, Any], title: str = "Certificat
         "good" if passed else "bad",
     )
     rows = [
-        [_words(c["name"]), c["value"], c["limit"], c.get("unit", ""), bool(c["passed"])]
+        [_words(c["name"]), c["value"], _limit(c), c.get("unit", ""), bool(c["passed"])]
         for c in checks
     ]
-    tones = {i: "good" if c["passed"] else "bad" for i, c in enumerate(checks)}
-    table = Table(["check", "value", "limit", "unit", "passed"], rows, tones=tones)  # type: ignore[arg-type]
+    tones: dict[int, Tone] = {i: "good" if c["passed"] else "bad" for i, c in enumerate(checks)}
+    table = Table(["check", "value", "limit", "unit", "passed"], rows, tones=tones)
     return Section(
         title,
         [verdict, table],
@@ -251,10 +253,15 @@ def provenance_section(facts: Mapping[str, Any]) -> Section:
     return Section("Provenance", [Table(["", ""], rows)])
 
 
+def _limit(check: Mapping[str, Any]) -> str:
+    sense = {"<=": "≤ ", ">=": "≥ "}.get(check.get("sense", ""), "")
+    return "recorded" if check["limit"] is None else f"{sense}{number(check['limit'])}"
+
+
 def _text(value: Any) -> str:
     if isinstance(value, (list, tuple)):
-        return ", ".join(str(v) for v in value)
-    return str(value)
+        return ", ".join(_text(v) for v in value)
+    return number(value)
 
 
 def _words(name: str) -> str:

@@ -119,7 +119,7 @@ def whole_page() -> pages.Page:
         [
             pages.Section(
                 "Asked and achieved",
-                [sections.asked_achieved_tiles({"bar_height": 1.0}, {"bar_height": 1.03})],
+                [sections.asked_achieved_tiles({"bar_height": 1.0}, {"replay": 1.03}, "m")],
             ),
             sections.certificate_section({"checks": checks, "passed": False}),
             sections.parity_section(parity),

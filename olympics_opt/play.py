@@ -1,0 +1,167 @@
+"""Playing a policy: ``train``, ``evaluate`` and ``render``, with a progress display."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from olympics_opt import atomic
+from olympics_opt.progress import progress
+
+if TYPE_CHECKING:
+    from olympics_opt.cli import Evaluate, Render
+    from rl.evaluate import EvaluationResult
+
+
+def athlete(
+    policy: str, task: str, strength: str | None = None, limits: str | None = None
+) -> tuple[str, str]:
+    """Strength and limits with which a policy is played: as asked, else as it was trained.
+
+    Raises PolicyError for a policy that cannot be used with the task.
+    """
+    from rl.policy import load_policy
+    from sports.registry import get_task
+
+    get_task(task)
+    card = load_policy(policy, task).metadata
+    return strength or card.get("strength", "paper"), limits or card.get("limits", "paper")
+
+
+def play(
+    task: str,
+    policy: str,
+    *,
+    engine: str = "mujoco",
+    trials: int,
+    seed: int = 0,
+    worlds: int | None = None,
+    strength: str | None = None,
+    limits: str | None = None,
+    options: dict[str, Any] | None = None,
+    timestep_divisor: int = 1,
+    processes: int = 1,
+    record: bool = False,
+    label: str = "",
+) -> EvaluationResult:
+    """``rl.evaluate.evaluate`` with a line of progress; its errors and its result.
+
+    ``processes`` is for Drake, which steps its worlds one after another.
+    """
+    from rl.evaluate import evaluate
+
+    with progress(f"playing {task}, {label or engine}") as bar:
+        played = evaluate(
+            policy,
+            task,
+            engine=engine,
+            trials=trials,
+            seed=seed,
+            num_worlds=worlds,
+            strength=strength,
+            limits=limits,
+            options=options,
+            timestep_divisor=timestep_divisor,
+            record=int(record),
+            processes=processes,
+            progress=lambda done, total: bar.show(f"{done} of {total} trials", done, total),
+        )
+        success = played.result["metrics"]["success"]["mean"]
+        bar.finish(f"{trials} trials, success {success:.0%}")
+    return played
+
+
+def run_evaluate(config: Evaluate) -> int:
+    """The command: prints the metrics and writes the result schema."""
+    from olympics_opt.cli import chosen_options
+
+    played = play(
+        config.name,
+        config.policy,
+        engine=config.engine,
+        trials=config.trials,
+        seed=config.seed,
+        worlds=config.worlds,
+        strength=config.strength,
+        limits=config.limits,
+        options=chosen_options(config, "task"),
+        processes=config.processes,
+    )
+    print_metrics(played.result)
+    print(f"wrote {atomic.write_json(config.out, played.result)}")
+    return 0
+
+
+def print_metrics(result: dict[str, Any]) -> None:
+    """The metrics of a result as a table on the terminal."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from olympics_opt.report.page import number
+
+    table = Table(
+        title=f"{result['task']}, {result['algo']}, strength {result['strength']}, "
+        f"{result['engine']}, {result['trials']} trials, seed {result['seed']}",
+        title_justify="left",
+        box=None,
+    )
+    for name in ("metric", "mean", "95 % interval", "n", "unit"):
+        table.add_column(name, justify="left" if name in ("metric", "unit") else "right")
+    for name, m in result["metrics"].items():
+        low, high = m["ci95"] or (None, None)
+        table.add_row(
+            name, number(m["mean"]), f"[{number(low)}, {number(high)}]", str(m["n"]), m["unit"]
+        )
+    console = Console()
+    console.print(table)
+    for name in ("nan_worlds", "overflow"):
+        if result[name]:
+            console.print(f"[red]{name}: {result[name]} worlds[/red]")
+
+
+def run_render(config: Render) -> int:
+    """The command. Raises ValueError without anything to write, RuntimeError without GL."""
+    from olympics_opt.cli import chosen_options
+    from olympics_opt.render import render_sheet, render_video
+    from rl import provenance
+
+    if config.out is None and config.sheet is None:
+        raise ValueError("give --out FILE.mp4 for a video, --sheet FILE.png for a sheet, or both")
+    for path, suffix in ((config.out, ".mp4"), (config.sheet, ".png")):
+        if path is not None and path.suffix.lower() != suffix:
+            raise ValueError(f"{path} must end in {suffix}")
+    played = play(
+        config.name,
+        config.policy,
+        engine=config.engine,
+        trials=config.trials,
+        seed=config.seed,
+        strength=config.strength,
+        limits=config.limits,
+        options=chosen_options(config, "task"),
+        processes=config.processes,
+        record=True,
+    )
+    written: list[Path] = []
+    if config.sheet is not None:
+        episodes = {"best": played.best, "median": played.median}
+        written.append(render_sheet(episodes, config.sheet, commit=provenance.commit()))
+    if config.out is not None:
+        written.append(
+            render_video(played.best, config.out, renderer=config.renderer, progress=True)
+        )
+    for path in written:
+        print(f"wrote {path}")
+    return 0
+
+
+def run_train(args: list[str]) -> int:
+    """The command: ``rl.train`` under this program's name. Asked to stop, it saves and is done."""
+    from rl.train import parse_args, train
+
+    summary = train(parse_args(args, prog="olympics-opt train"))
+    print(
+        f"stopped by {summary.stopped_by} after {summary.samples:,} samples, "
+        f"{summary.minutes:.1f} minutes: {summary.checkpoint}"
+    )
+    return 0
