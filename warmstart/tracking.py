@@ -13,9 +13,10 @@ Sampling, section 3; Williams 2017, Model Predictive Path Integral Control, for 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import mujoco
@@ -23,9 +24,11 @@ import numpy as np
 import torch
 from mujoco.batch import Batch
 
+from sports import long_jump
 from sports.env import Starts, make_env, make_scene
 from sports.humanoid.body import Body, load_body
 from sports.humanoid.mjcf import build_spec
+from sports.physics.base import Geometry
 from sports.registry import task_names
 from sports.scene import Scene, humanoid_scene
 from warmstart.clip import Clip, clip_from_solution
@@ -55,6 +58,12 @@ class Weights:
     """Per squared share of the servo's range by which targets leave the reference's."""
     bar: float = 400.0
     """Per m by which the bar has moved."""
+    foul: float = 400.0
+    """Per m by which a contact before the take-off lies beyond the line."""
+    mark: float = 100.0
+    """Per m by which a contact after the landing lies behind the asked mark."""
+    after: float = 0.02
+    """Share of the tracking terms that counts after the reference has ended."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +109,43 @@ class _Reference:
     link_pos: np.ndarray  # (T, B, 3)
     link_quat: np.ndarray  # (T, B, 4)
     whole: np.ndarray  # (T, 9) centre of mass, its velocity, angular momentum about it
+
+    def held(self, frames: int) -> _Reference:
+        """With the last frame repeated: where a task needs to see what comes after."""
+
+        def hold(x: np.ndarray) -> np.ndarray:
+            return np.concatenate([x, np.repeat(x[-1:], frames, axis=0)])
+
+        return _Reference(*(hold(getattr(self, f.name)) for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class _JumpRules:
+    """Contacts that the long jump punishes, from the links' support points."""
+
+    takeoff: int
+    """Frame of the reference from which it flies."""
+    mark: float
+    """x at which the jump is to be measured (m)."""
+    geometry: Geometry
+    weights: Weights
+
+    AFTER = long_jump.MARK_STEPS + 3
+    """Frames that are planned beyond the reference, in which marks count."""
+
+    def cost(self, at: int, pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
+        """(N,) of links at pos (N, B, 3), quat (N, B, 4) at a frame."""
+        links = (torch.from_numpy(x.astype(np.float32)) for x in (pos, quat))
+        points = self.geometry.world_points(*links)
+        height = (points[..., 2] - self.geometry.radii).numpy()
+        x = points[..., 0].numpy()
+        if at <= self.takeoff:
+            beyond = np.where(height < 0.01, x - long_jump.LINE_X + 0.01, 0.0)
+            return self.weights.foul * np.maximum(beyond.max(1), 0.0)
+        # Near the ground counts in part, so that candidates see a slope before they touch.
+        near = np.clip(1.0 - height / 0.15, 0.0, 1.0)
+        behind = np.maximum(self.mark - x, 0.0) * near
+        return self.weights.mark * behind.max(1) if at > self.takeoff + 4 else np.zeros(len(x))
 
 
 class _Worlds:
@@ -175,8 +221,11 @@ def track(
     begin = time.perf_counter()
     worlds = _Worlds(scene, settings.worlds, threads)
     frames = _reference(clip, worlds)
-    qpos, qvel, ctrl = _follow(frames, worlds, settings, progress)
-    steps = len(frames.ctrl) - 1
+    steps, rules = len(frames.ctrl) - 1, None
+    if clip.meta.get("problem") == "long_jump":
+        rules = _jump_rules(clip, scene, settings.weights)
+        frames = frames.held(_JumpRules.AFTER)
+    qpos, qvel, ctrl = _follow(frames, steps, worlds, settings, rules, progress)
     tracked = replace(
         clip,
         fps=1.0 / scene.control_timestep,
@@ -276,6 +325,16 @@ def play(
     return out, {k: m for k, m in metrics.items() if np.isfinite(m)}
 
 
+def _jump_rules(clip: Clip, scene: Scene, weights: Weights) -> _JumpRules:
+    events, asked = clip.meta.get("events", {}), clip.meta.get("asked", {})
+    return _JumpRules(
+        takeoff=math.ceil(float(events.get("takeoff", 0.0)) / scene.control_timestep),
+        mark=long_jump.LINE_X + float(asked.get("length", 0.0)),
+        geometry=Geometry(scene.body, "cpu"),
+        weights=weights,
+    )
+
+
 def _reference(clip: Clip, worlds: _Worlds) -> _Reference:
     scene = worlds.scene
     rate = 1.0 / scene.control_timestep
@@ -297,8 +356,10 @@ def _spline(knots: np.ndarray, steps: int, every: int) -> np.ndarray:
 
 def _follow(
     frames: _Reference,
+    end: int,
     worlds: _Worlds,
     settings: Tracking,
+    rules: _JumpRules | None,
     progress: Callable[[int, int], None] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The receding horizon loop: qpos (T, 7 + n), qvel (T, 6 + n) and ctrl (T, n)."""
@@ -320,7 +381,7 @@ def _follow(
 
     def cost_of(offset: np.ndarray, ahead: np.ndarray, state: _State) -> np.ndarray:
         targets = np.clip(frames.ctrl[ahead] + offset[:, : len(ahead)], -limit, limit)
-        cost = _rollout(frames, worlds, targets, int(ahead[0]), state, weights)
+        cost = _rollout(frames, end, worlds, targets, int(ahead[0]), state, weights, rules)
         return cost + weights.effort * np.mean((offset / unit) ** 2, axis=(1, 2)) * len(ahead)
 
     for now in range(steps):
@@ -356,11 +417,13 @@ def _follow(
 
 def _rollout(
     frames: _Reference,
+    end: int,
     worlds: _Worlds,
     targets: np.ndarray,
     now: int,
     state: _State,
     weights: Weights,
+    rules: _JumpRules | None,
 ) -> np.ndarray:
     """(N,) cost of N target sequences (N, H, n) from one state."""
     scene = worlds.scene
@@ -385,6 +448,10 @@ def _rollout(
             + weights.spin * whole[:, 6:].sum(1)
             + weights.joint_rate * np.mean(rate**2, axis=1)
         )
+        if at > end:
+            step *= weights.after
+        if rules is not None:
+            step += rules.cost(at, pos, quat)
         if bar is not None:
             shift = np.linalg.norm(
                 worlds.qpos[:count, bar][:, :3] - scene.default_qpos()[bar][:3], axis=1
