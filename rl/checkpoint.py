@@ -93,6 +93,8 @@ def save_checkpoint(
             _sync_folder(folder)
             for old in checkpoints(run)[:-KEEP]:
                 shutil.rmtree(old, ignore_errors=True)
+        if barrier is not None:  # nobody looks for it before it has its name
+            barrier()
     except OSError as error:
         shutil.rmtree(part, ignore_errors=True)
         have = checkpoints(run)

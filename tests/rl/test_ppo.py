@@ -11,7 +11,7 @@ import torch
 from rl.ppo import PAPER, PPO, PPOConfig, adapted_rate, gaussian_log_prob, surrogate_loss
 from rl.rollout import Rollout
 from rl.train import train
-from tests.rl.toy import SMALL, A, B, Q, R, Integrator, optimal_cost, toy_config, toy_env
+from tests.rl.toy import SMALL, A, B, Integrator, Q, R, optimal_cost, toy_config, toy_env
 
 
 def filled_rollout(agent: PPO, rows: int, seed: int) -> tuple[Rollout, torch.Tensor]:

@@ -1,0 +1,219 @@
+"""Runs: bit-for-bit resume, signals and kills, full disks, settings, several ranks."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+import rl.checkpoint
+from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
+from rl.policy import PolicyError
+from rl.ppo import PAPER, PPOConfig
+from rl.runlog import read_progress
+from rl.train import TrainConfig, main, parse_args, train
+from tests.rl.toy import SMALL, toy_config, toy_env
+
+ROOT = Path(__file__).parents[2]
+TIMES = {"minutes", "samples_per_s", "rollout_s", "update_s"}
+
+
+def rows(run: Path) -> list[dict[str, str]]:
+    """progress.csv as text, without what a clock says."""
+    with open(run / "progress.csv", newline="") as f:
+        return [{k: v for k, v in r.items() if k not in TIMES} for r in csv.DictReader(f)]
+
+
+def last(run: Path) -> dict[str, torch.Tensor]:
+    return load_checkpoint(checkpoints(run)[-1])[1]
+
+
+def same_bits(a: Path, b: Path) -> None:
+    left, right = last(a), last(b)
+    assert set(left) == set(right)
+    for name, x in left.items():
+        torch.testing.assert_close(right[name], x, rtol=0, atol=0, equal_nan=True, msg=name)
+    assert rows(a) == rows(b)
+
+
+@pytest.mark.parametrize("task", ["high_jump", "long_jump"])
+def test_a_resumed_run_repeats_the_uninterrupted_one_bit_for_bit(tmp_path, task):
+    small = PPOConfig(hidden=(16, 16), steps=12, minibatches=2, epochs=2, sigma_final=0.06)
+    each = 12 * 12
+    base = TrainConfig(task=task, worlds=12, samples=4 * each, seed=3, quiet=True, ppo=small)
+    train(dataclasses.replace(base, out=tmp_path / "whole"))
+
+    class Interrupted(Exception):
+        pass
+
+    def stop(row):
+        if row["iteration"] == 3:  # after the checkpoint of iteration 2: that one is lost
+            raise Interrupted
+
+    halves = dataclasses.replace(base, out=tmp_path / "halves", checkpoint_iterations=2)
+    with pytest.raises(Interrupted):
+        train(halves, on_iteration=stop)
+    assert len(rows(tmp_path / "halves")) == 3
+    summary = train(TrainConfig(task=task, out=tmp_path / "halves", resume=True, quiet=True))
+    assert (summary.iterations, summary.samples) == (4, 4 * each)
+    same_bits(tmp_path / "whole", tmp_path / "halves")
+    assert [r["iteration"] for r in read_progress(tmp_path / "halves")] == [1, 2, 3, 4]
+
+
+def start(out: Path, samples: int, *args: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "tests.rl.toy", str(out), str(samples), *args]
+    env = {**os.environ, "OMP_NUM_THREADS": "1"}
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, cwd=ROOT, env=env, text=True, stdout=pipe, stderr=pipe)
+
+
+def wait_for(condition, process: subprocess.Popen[str]) -> None:
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+
+
+def test_kill_at_any_moment_then_resume_is_the_uninterrupted_run(tmp_path):
+    train(toy_config(tmp_path / "whole", samples=30 * 1024), environment=toy_env)
+    killed = tmp_path / "killed"
+    process = start(killed, 10**9)
+    wait_for(
+        lambda: len(checkpoints(killed)) > 0 and checkpoints(killed)[-1].name > "step_0000004",
+        process,
+    )
+    process.send_signal(signal.SIGKILL)
+    assert process.wait(60) == -signal.SIGKILL
+    done = json.loads((checkpoints(killed)[-1] / "state.json").read_text())["iteration"]
+    assert done >= 5
+    if done >= 30:
+        pytest.skip("this machine was too quick to be killed in time")
+    train(toy_config(killed, samples=30 * 1024, resume=True), environment=toy_env)
+    same_bits(tmp_path / "whole", killed)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_saves_and_exits_0(tmp_path, number):
+    process = start(tmp_path, 10**9)
+    wait_for(lambda: (tmp_path / "progress.csv").is_file(), process)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert "stopped by signal" in out
+    assert int(out.split()[-1]) == len(rows(tmp_path)) == int(checkpoints(tmp_path)[-1].name[5:])
+
+
+def test_a_full_disk_ends_the_run_with_a_sentence(tmp_path, monkeypatch):
+    real = os.fsync
+
+    def fsync(handle: int) -> None:
+        if len(checkpoints(tmp_path)) == 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(handle)
+
+    monkeypatch.setattr(rl.checkpoint.os, "fsync", fsync)
+    with pytest.raises(CheckpointError, match="No space left on device"):
+        train(toy_config(tmp_path, checkpoint_iterations=1), environment=toy_env)
+    monkeypatch.undo()
+    assert [p.name for p in checkpoints(tmp_path)] == ["step_0000001", "step_0000002"]
+    summary = train(toy_config(tmp_path, resume=True), environment=toy_env)
+    assert summary.iterations == 4
+
+
+def test_stops_by_minutes_and_writes_what_ran(tmp_path):
+    summary = train(toy_config(tmp_path, samples=None, minutes=0.01), environment=toy_env)
+    assert summary.stopped_by == "minutes"
+    data = json.loads((tmp_path / "config.json").read_text())
+    assert data["config"]["ppo"]["hidden"] == [32, 32]
+    assert {"commit", "versions", "hardware"} <= set(data)
+    assert list((tmp_path / "tensorboard").glob("events*"))
+
+
+def test_settings_that_contradict_a_run_are_refused(tmp_path):
+    train(toy_config(tmp_path, samples=1024), environment=toy_env)
+    with pytest.raises(ValueError, match="--resume"):
+        train(toy_config(tmp_path), environment=toy_env)
+    with pytest.raises(ValueError, match="worlds 32 differs from the run's 64"):
+        train(toy_config(tmp_path, resume=True, worlds=32), environment=toy_env)
+    with pytest.raises(ValueError, match="run of task 'toy'"):
+        train(toy_config(tmp_path, resume=True, task="long_jump"), environment=toy_env)
+    for bad in ({"worlds": 0}, {"minutes": -1.0}, {"start_probability": (0.5, 1.5)}):
+        with pytest.raises(ValueError, match=next(iter(bad))):
+            TrainConfig(task="toy", **bad)
+    with pytest.raises(ValueError, match="--paper"):
+        TrainConfig(task="toy", paper=True, ppo=SMALL)
+
+
+def test_fine_tuning_starts_from_the_policy(tmp_path):
+    first = train(toy_config(tmp_path / "a", samples=8 * 1024), environment=toy_env)
+    before = {k: v for k, v in last(tmp_path / "a").items() if k.startswith("agent/actor.")}
+    frozen = dataclasses.replace(SMALL, hidden=(8,), learning_rate=0.0, kl_band=None)
+    train(
+        toy_config(tmp_path / "b", samples=2 * 1024, ppo=frozen, init=str(tmp_path / "a")),
+        environment=toy_env,
+    )
+    after = last(tmp_path / "b")
+    for name, x in before.items():  # with rate 0 the actor stays what it was, hidden sizes too
+        assert torch.equal(after[name], x)
+    counts = [float(last(tmp_path / n)["agent/obs_norm.total"][0]) for n in "ab"]
+    assert counts[0] == first.samples
+    assert counts[1] == pytest.approx(first.samples + 2 * 1024)
+    with pytest.raises(PolicyError, match="task 'toy'"):
+        train(TrainConfig(task="long_jump", out=tmp_path / "c", init=str(tmp_path / "a")))
+
+
+def test_command_line():
+    config = parse_args(["high_jump", "--worlds", "8", "--task.bar-height", "1.2", "--paper"])
+    assert (config.task, config.worlds, config.options["bar_height"]) == ("high_jump", 8, 1.2)
+    assert config.hyper == PAPER
+    config = parse_args(["long_jump", "--ppo.sigma", "0.1", "--strength", "human"])
+    assert (config.ppo.sigma, config.strength) == (0.1, "human")
+
+
+@pytest.mark.parametrize("args", [["chess"], [], ["long_jump", "--init", "nowhere"]])
+def test_mistakes_exit_with_2_and_a_sentence(args, capsys, tmp_path):
+    assert main([*args, *(["--out", str(tmp_path)] if args else [])]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+
+
+def test_two_ranks_learn_what_one_process_learns_from_both_batches(tmp_path):
+    """gloo on the CPU: gradients, divergence and statistics merge; only rank 0 writes."""
+    script = str(Path(__file__).with_name("ranks.py"))
+    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, *launch, script, str(tmp_path)],
+        cwd=ROOT,
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    from tests.rl.ranks import learn
+
+    learn(tmp_path / "one.json", slice(None))
+    one, rank0, rank1 = (
+        json.loads((tmp_path / f"{n}.json").read_text()) for n in ("one", "rank0", "rank1")
+    )
+    assert rank0 == rank1
+    for name, values in one.items():
+        torch.testing.assert_close(
+            torch.tensor(rank0[name]), torch.tensor(values), rtol=1e-4, atol=2e-6, msg=name
+        )
+    # and whole runs: one log, resumable, both ranks' worlds counted
+    assert [r["samples"] for r in read_progress(tmp_path / "run")] == [2048, 4096, 6144, 8192]
+    files = {p.name for p in checkpoints(tmp_path / "run")[-1].iterdir()}
+    assert {"rank0.json", "rank1.json", "state.json"} <= files
+    state = [load_checkpoint(checkpoints(tmp_path / "run")[-1], r)[1] for r in (0, 1)]
+    assert torch.equal(state[0]["agent/actor.head.weight"], state[1]["agent/actor.head.weight"])
+    assert not torch.equal(state[0]["env/x"], state[1]["env/x"])
