@@ -1,0 +1,139 @@
+"""The benchmark measures what it says: steps by the engine's own clock, time by ours."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from olympics_opt import bench
+from rl.ppo import PPOConfig
+from sports.env import make_env
+
+SMALL = PPOConfig(hidden=(16,), steps=6, minibatches=2, epochs=1)
+
+
+@pytest.fixture
+def meter():
+    env = make_env("high_jump", num_worlds=4, seed=3)
+    ticks = itertools.count()
+    # A clock that advances one second between two looks: a block takes exactly one.
+    yield bench.Meter(env, steps=12, hyper=SMALL, clock=lambda: float(next(ticks)))
+    env.close()
+
+
+def test_bare_physics_takes_the_steps_it_reports(meter: bench.Meter) -> None:
+    env = meter.env
+    time = env.physics.batch.bind("time")
+    taken, stepped = 0.0, meter._bare
+
+    def counted(targets: torch.Tensor) -> None:
+        nonlocal taken
+        before = time.copy()
+        stepped(targets)
+        taken += float((time - before).sum())
+
+    meter._bare = counted
+    before = {k: v.clone() for k, v in env.state_dict().items()}
+    rate = meter.bare_physics()
+    # 12 control steps in blocks of 8 and 4, one second of our clock each.
+    assert rate == pytest.approx(4 * 12 / 2)
+    assert taken == pytest.approx(4 * 12 * env.physics.scene.control_timestep)
+    after = env.state_dict()
+    for name, value in before.items():
+        torch.testing.assert_close(after[name], value, rtol=0, atol=0, equal_nan=True)
+
+
+def test_bare_physics_is_the_environments_physics(meter: bench.Meter) -> None:
+    """The same controls from the same state lead to the same positions."""
+    env = meter.env
+    controls = meter._controls[0]
+    state = env.state_dict()
+    env.physics.step(controls)
+    want = env.physics.qpos.clone()
+    env.load_state_dict(state)
+    meter._bare(controls)
+    got = torch.from_numpy(env.physics.batch.bind("qpos").copy()).float()
+    assert torch.allclose(got, want, atol=1e-6)
+
+
+def test_environment_and_training_count_their_samples(meter: bench.Meter) -> None:
+    env = meter.env
+    steps = 0
+    step = env.step
+
+    def counted(action: torch.Tensor):
+        nonlocal steps
+        steps += 1
+        return step(action)
+
+    env.step = counted
+    assert meter.environment() == pytest.approx(4 * 12)
+    assert steps == 12
+    weights = meter.agent.actor.head.weight.detach().clone()
+    assert meter.training() == pytest.approx(4 * 6)
+    assert steps == 12 + 6
+    meter.training()
+    assert not torch.equal(weights, meter.agent.actor.head.weight)
+
+
+def test_shares_are_taken_within_a_turn() -> None:
+    # The machine slows down tenfold in the second turn; the ratio does not care.
+    turns = [
+        {"bare_physics": 1000.0, "environment": 900.0, "training": 800.0},
+        {"bare_physics": 100.0, "environment": 90.0},
+        {"bare_physics": 1000.0, "environment": 910.0, "training": 780.0},
+    ]
+    row = bench.summary(turns)
+    assert row["environment_share"] == pytest.approx(0.9)
+    assert row["training_share"] == pytest.approx(0.79)
+    assert row["spread"]["bare_physics"] == [100.0, 1000.0]
+    assert bench.summary([t for t in turns if "training" not in t])["training"] is None
+
+
+def test_file_holds_rows_and_where_they_come_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "bench.json"
+    status = bench.main(
+        ["--out", str(out), "--task", "long_jump", "--worlds", "2", "--seconds", "0.01"]
+        + ["--engine", "mujoco", "--no-training"]
+    )
+    assert status == 0
+    result = json.loads(out.read_text())
+    assert {"commit", "versions", "hardware", "seed", "rows"} <= set(result)
+    (row,) = result["rows"]
+    assert row["task"] == "long_jump" and row["worlds"] == 2 and row["training"] is None
+    assert row["turns"] >= 3 and row["environment"] > 0
+    assert "long_jump" in capsys.readouterr().out
+
+
+def test_mistakes_get_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="unknown task"):
+        bench.bench(tmp_path / "b.json", tasks=("swimming",))
+    with pytest.raises(ValueError, match="seconds"):
+        bench.bench(tmp_path / "b.json", seconds=0)
+    if not torch.cuda.is_available():
+        with pytest.raises(RuntimeError, match="GPU"):
+            bench.measure("long_jump", "warp", worlds=1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_bare_warp_is_the_environments_physics() -> None:
+    """Warp's CPU device: the benchmark's substeps lead where the engine's own step leads."""
+    pytest.importorskip("mujoco_warp")
+    env = make_env("long_jump", engine="warp", num_worlds=2, physics_options={"device": "cpu"})
+    try:
+        meter = bench.Meter(env, training=False, steps=2)
+        state = env.state_dict()
+        env.physics.step(meter._controls[0])
+        want = env.physics.qpos.clone()
+        env.load_state_dict(state)
+        meter._bare(meter._controls[0])
+        assert torch.allclose(env.physics.qpos, want, atol=1e-5)
+        assert not torch.allclose(want, state["qpos"])
+    finally:
+        env.close()
