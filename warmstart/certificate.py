@@ -27,20 +27,17 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import torch
 
-from sports.humanoid.body import Body, load_body
 from sports.humanoid.mjcf import body_name, build_model
-from sports.physics import PhysicsState, make_physics
-from sports.scene import Scene, humanoid_scene
+from sports.scene import humanoid_scene
+from warmstart.inverse_dynamics import inverse_dynamics_drake, inverse_dynamics_mujoco
 from warmstart.outcome import OUTCOMES, support
+from warmstart.replay import replay
 from warmstart.solution import Solution
 
 FINER = 5
 """Samples per interval of the optimiser."""
 GRAVITY = 9.81
-REPLAY_RATE = 480.0
-"""Control and simulation rate of the replays (Hz)."""
 LOADED = 0.01
 """A contact point counts as loaded from this share of body weight on."""
 
@@ -307,67 +304,6 @@ def _dynamics(solution: Solution, notes: dict[str, str]) -> dict[str, float]:
     return out
 
 
-def inverse_dynamics_mujoco(solution: Solution, motion: dict[str, np.ndarray]) -> np.ndarray:
-    """(T, nv) forces needed besides gravity, damping and contact, by MuJoCo.
-
-    The first three act on the root in world axes (N), the next three are the moment about its
-    origin in the root's axes (N m); both are zero for a true motion. The rest are servo torques.
-    """
-    model = build_model(solution.body)
-    model.opt.disableflags |= int(
-        mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
-    )
-    data = mujoco.MjData(model)
-    links = [model.body(body_name(0, link)).id for link, _ in solution.contact_points]
-    out, jac = np.zeros((len(motion["qpos"]), model.nv)), np.zeros((3, model.nv))
-    for t in range(len(out)):
-        data.qpos[:], data.qvel[:] = motion["qpos"][t], motion["qvel"][t]
-        data.qacc[:] = motion["qacc"][t]
-        mujoco.mj_inverse(model, data)
-        out[t] = data.qfrc_inverse
-        for c, (_, point) in enumerate(solution.contact_points):
-            where = data.xpos[links[c]] + data.xmat[links[c]].reshape(3, 3) @ np.array(point)
-            mujoco.mj_jac(model, data, jac, None, where, links[c])
-            out[t] -= jac.T @ motion["contact_force"][t, c]
-    return out
-
-
-def inverse_dynamics_drake(solution: Solution, motion: dict[str, np.ndarray]) -> np.ndarray:
-    """(T, nv) the same as :func:`inverse_dynamics_mujoco`, by Drake, in MuJoCo's coordinates."""
-    from pydrake.multibody.math import SpatialForce
-    from pydrake.multibody.tree import MultibodyForces
-
-    from sports.humanoid.drake_plant import build_plant, rotate
-
-    built = build_plant(solution.body, time_step=0.0, ground=False)
-    plant, human = built.plant, built.humanoid
-    context = plant.CreateDefaultContext()
-    world = plant.world_frame()
-    points = [
-        (human.links[solution.body.link_index(link)], np.array(point))
-        for link, point in solution.contact_points
-    ]
-    quat = motion["qpos"][:, 3:7]
-    out = np.zeros((len(quat), 6 + solution.body.num_dofs))
-    q, v, a = (np.zeros(n) for n in (plant.num_positions(), *[plant.num_velocities()] * 2))
-    for t in range(len(out)):
-        q[human.q_index], v[human.v_index] = human.to_drake(motion["qpos"][t], motion["qvel"][t])
-        qacc = motion["qacc"][t]
-        spin_up = rotate(quat[t], qacc[3:6])  # d/dt (R w_B) = R d/dt w_B
-        a[human.v_index] = np.concatenate([spin_up, qacc[:3], qacc[6:]])
-        plant.SetPositions(context, q)
-        plant.SetVelocities(context, v)
-        forces = MultibodyForces(plant)
-        plant.CalcForceElementsContribution(context, forces)  # gravity and joint damping
-        for c, (link, point) in enumerate(points):
-            push = SpatialForce(tau=np.zeros(3), f=motion["contact_force"][t, c])
-            arm = link.body_frame().CalcRotationMatrixInWorld(context).matrix() @ point
-            link.AddInForce(context, arm, push, world, forces)
-        tau = plant.CalcInverseDynamics(context, a, forces)[human.v_index]
-        out[t] = human.velocity_map(quat[t]).T @ tau
-    return out
-
-
 def _contact(solution: Solution) -> dict[str, float]:
     """Forces inside the friction cone, pushing only, at points that rest on the ground."""
     motion = solution.sample(fine_times(solution))
@@ -450,40 +386,3 @@ def _replay(solution: Solution, engine: str, achieved: dict[str, float]) -> dict
         f"replay in {engine}: outcome": outcome,
         f"replay in {engine}: root error": float(error.max()),
     }
-
-
-def replay(
-    solution: Solution, engine: str, hold: float = 0.5, scene: Scene | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Plays the torques open loop at ``REPLAY_RATE``: targets q + torque / kp, clipped by the
-    servo, then the last targets for ``hold`` s. The athlete is alone on the ground.
-
-    Returns times (T,) s from the first frame and qpos (T, 7 + n). Raises RuntimeError when the
-    simulation diverges.
-    """
-    scene = scene or humanoid_scene(solution.body, timestep=1.0 / REPLAY_RATE, substeps=1)
-    physics = make_physics(engine, scene, 1)
-    planned = math.floor(solution.duration * REPLAY_RATE)
-    steps = planned + round(hold * REPLAY_RATE)
-    middle = np.minimum((np.arange(steps) + 0.5) / REPLAY_RATE, solution.duration)
-    motion = solution.sample(solution.times[0] + middle)
-    targets = motion["qpos"][:, 7:] + motion["torque"] / solution.body.array("kp")
-    state = PhysicsState(
-        torch.tensor(solution.qpos[:1], dtype=torch.float32),
-        torch.tensor(solution.qvel[:1], dtype=torch.float32),
-        torch.zeros(1, 0, 3),
-    )
-    physics.reset(torch.ones(1, dtype=torch.bool), state)
-    out = [physics.qpos[0].double().numpy().copy()]
-    for target in targets:
-        physics.step(torch.tensor(target[None], dtype=torch.float32))
-        if bool(physics.bad.any()):
-            raise RuntimeError(f"the replay diverged in {engine} after {len(out)} steps")
-        out.append(physics.qpos[0].double().numpy().copy())
-    physics.close()
-    return np.arange(len(out)) / REPLAY_RATE, np.array(out)
-
-
-def athlete(name: str, strength: str) -> Body:
-    """The body of a certificate. Raises ValueError for an unknown name or strength."""
-    return load_body(name, strength=strength)  # type: ignore[arg-type]

@@ -5,9 +5,9 @@ Drake plant through AutoDiff instead of a hand-written recursion, another solver
 write the program. The question asked is about the part of a jump where effort and forces decide,
 the last stance before a flight:
 
-    Given the state at which the athlete enters this stance and the state at which it leaves the
-    ground (hence the same flight, the same bar or the same length), and the same timing, which
-    torques need the least effort?
+    Given the state and acceleration with which the athlete enters this stance and those with
+    which it leaves the ground (hence the same flight, the same bar or the same length), and the
+    same timing, which torques need the least effort?
 
 By the principle of optimality the stance of an optimal jump must solve this problem. So SNOPT
 started from it should find it feasible and hardly better; started cold, from a straight line
@@ -132,7 +132,7 @@ class StanceProgram:
         held_limits: Sequence[str] = HELD_LIMITS,
     ) -> None:
         self.solution, self.stance = solution, last_stance(solution)
-        self.weights = weights or Weights()
+        self.weights = weights or Weights(**solution.stats.get("weights", {}))
         self.bounds = bounds or Bounds(boxes(POSITION), boxes(RATE))
         stance = self.stance
         keep = slice(stance.first, stance.last + 1)
@@ -175,15 +175,16 @@ class StanceProgram:
         """The two end states, torque and acceleration limits, friction, pose boxes."""
         prog, K = self.program, self.K
         for k in (0, K - 1):
+            rate, acceleration = self.v_ref[k] / RATE_SCALE, self.a_ref[k] / ACCELERATION_SCALE
             prog.AddBoundingBoxConstraint(self.q_ref[k], self.q_ref[k], self.q[k])
-            rate = self.v_ref[k] / RATE_SCALE
             prog.AddBoundingBoxConstraint(rate, rate, self.v[k])
+            prog.AddBoundingBoxConstraint(acceleration, acceleration, self.a[k])
         positions, rates = self._box(self.bounds.position), self._box(self.bounds.rate, 20.0)
         for k in range(1, K - 1):
             prog.AddBoundingBoxConstraint(*positions, self.q[k])
             prog.AddBoundingBoxConstraint(*(rate / RATE_SCALE for rate in rates), self.v[k])
         limit = self.bounds.acceleration / ACCELERATION_SCALE
-        prog.AddBoundingBoxConstraint(-limit, limit, self.a.ravel())
+        prog.AddBoundingBoxConstraint(-limit, limit, self.a[1:-1].ravel())
         prog.AddBoundingBoxConstraint(-1.0, 1.0, self.u.ravel())
         mx, my = self.bounds.friction_x, self.bounds.friction_y
         cone = np.array([[1, 0, -mx], [-1, 0, -mx], [0, 1, -my], [0, -1, -my]])
@@ -377,7 +378,7 @@ class StanceProgram:
         solver = SnoptSolver.id()
         options.SetOption(solver, "Major iterations limit", iterations)
         options.SetOption(solver, "Major feasibility tolerance", 1e-5)
-        options.SetOption(solver, "Major optimality tolerance", 1e-3)
+        options.SetOption(solver, "Major optimality tolerance", 1e-5)
         options.SetOption(solver, "Superbasics limit", 3000)
         begin = time.perf_counter()
         result = SnoptSolver().Solve(self.program, start, options)
@@ -396,8 +397,8 @@ def second_opinion(
     """Solves the last stance of a solution again with SNOPT.
 
     ``cold`` starts from a cubic between the end states instead of the solution; ``weights`` and
-    ``bounds`` must be those of the problem (None: those of the two jumps). Raises ValueError
-    when the solution has no stance before a flight.
+    ``bounds`` must be those of the problem (None: the weights in the solution's stats, the
+    bounds of the two jumps). Raises ValueError when the solution has no stance before a flight.
     """
     stance = StanceProgram(solution, weights, bounds)
     reference = stance.reference_point()

@@ -22,6 +22,8 @@ class Block:
 
     name: str
     index: np.ndarray
+    data: np.ndarray
+    """(instances, d) constants of each copy, appended to the parameters."""
     lower: np.ndarray
     """(instances, m) bounds of the rows."""
     upper: np.ndarray
@@ -83,12 +85,14 @@ class Program:
         name: str,
         inputs: Sequence[np.ndarray],
         build: Callable[..., tuple[object, list[tuple[str, object, object, object]]]],
+        data: np.ndarray | None = None,
     ) -> None:
         """Adds copies of one small function.
 
         ``inputs``: index arrays (instances, n_i); ``build(*vectors, p)`` gets SX vectors in
         physical units and returns (cost, [(row name, expression, lower, upper), ...]) where
-        bounds broadcast to (instances, size of the expression).
+        bounds broadcast to (instances, size of the expression). ``p`` holds the program's
+        parameters, then the copy's row of ``data`` (instances, d).
         """
         index = np.hstack([np.asarray(i).reshape(len(inputs[0]), -1) for i in inputs])
         instances = len(index)
@@ -98,9 +102,11 @@ class Program:
         if np.ptp(scale, axis=0).max() > 0:
             raise ValueError(f"block '{name}': copies have differently scaled variables")
         y = ca.SX.sym("y", index.shape[1])
-        p = ca.SX.sym("p", max(self.parameters, 1))
+        data = np.zeros((instances, 0)) if data is None else np.asarray(data, dtype=float)
+        p = ca.SX.sym("p", max(self.parameters, 1) + data.shape[1])
         x = y * ca.DM(scale[0])
-        split = ca.vertsplit(x, np.cumsum([0, *(np.asarray(i).size // instances for i in inputs)]).tolist())
+        widths = [np.asarray(i).size // instances for i in inputs]
+        split = ca.vertsplit(x, np.cumsum([0, *widths]).tolist())
         cost, rows = build(*split, p)
         names, lower, upper, expressions = [], [], [], []
         for row, expression, low, high in rows:
@@ -124,6 +130,7 @@ class Program:
             Block(
                 name=name,
                 index=index,
+                data=data,
                 lower=np.hstack(lower) if lower else empty,
                 upper=np.hstack(upper) if upper else empty,
                 row_names=tuple(names),
@@ -139,7 +146,10 @@ class Program:
         lower = np.concatenate([b.lower.ravel() for b in self.blocks])
         upper = np.concatenate([b.upper.ravel() for b in self.blocks])
         names = [
-            f"{b.name}.{row}@{k}" for b in self.blocks for k in range(len(b.index)) for row in b.row_names
+            f"{b.name}.{row}@{k}"
+            for b in self.blocks
+            for k in range(len(b.index))
+            for row in b.row_names
         ]
         return lower, upper, names
 
@@ -156,19 +166,20 @@ class Program:
         for b, count in zip(self.blocks, rows, strict=True):
             instances, width = b.index.shape
             x_b = ca.reshape(x[b.index.ravel().tolist()], width, instances)
-            costs, values = b.value.map(instances)(x_b, p)
+            p_b = ca.vertcat(ca.repmat(p, 1, instances), ca.DM(b.data.T))
+            costs, values = b.value.map(instances)(x_b, p_b)
             f += ca.sum2(costs)
             g.append(ca.vec(values))
             if b.gradient.n_instructions() > b.index.shape[1] + 1:  # else the cost is constant
-                gradient.append(ca.vec(b.gradient.map(instances)(x_b, p)))
+                gradient.append(ca.vec(b.gradient.map(instances)(x_b, p_b)))
                 gradient_of.append(b.index.ravel())
             row_of = start + np.arange(count).reshape(instances, b.rows)
             if b.rows:
                 r, c = (np.array(v, dtype=int) for v in b.jacobian.sparsity_out(0).get_triplet())
                 jac_ij.append((row_of[:, r].ravel(), b.index[:, c].ravel()))
-                jac_nz.append(_nonzeros(b.jacobian.map(instances)(x_b, p)))
+                jac_nz.append(_nonzeros(b.jacobian.map(instances)(x_b, p_b)))
             lam_b = ca.reshape(lam_g[start : start + count], b.rows, instances)
-            hess = b.hessian.map(instances)(x_b, p, lam_f, lam_b)
+            hess = b.hessian.map(instances)(x_b, p_b, lam_f, lam_b)
             r, c = (np.array(v, dtype=int) for v in b.hessian.sparsity_out(0).get_triplet())
             i, j = b.index[:, r].ravel(), b.index[:, c].ravel()
             hess_ij.append((np.minimum(i, j), np.maximum(i, j)))
@@ -177,14 +188,14 @@ class Program:
         g = ca.vertcat(*g)
         into = np.concatenate(gradient_of)
         grad = _scatter(ca.vertcat(*gradient), into, np.zeros_like(into), n, 1)
-        jac = _scatter(ca.vertcat(*jac_nz), *map(np.concatenate, zip(*jac_ij, strict=True)), m, n)
-        hess = _scatter(ca.vertcat(*hess_nz), *map(np.concatenate, zip(*hess_ij, strict=True)), n, n)
+        i, j = map(np.concatenate, zip(*jac_ij, strict=True))
+        jac = _scatter(ca.vertcat(*jac_nz), i, j, m, n)
+        i, j = map(np.concatenate, zip(*hess_ij, strict=True))
+        hess = _scatter(ca.vertcat(*hess_nz), i, j, n, n)
         settings = {
-            "grad_f": ca.Function("nlp_grad_f", [x, p], [f, ca.densify(grad)], ["x", "p"], ["f", "grad_f_x"]),
-            "jac_g": ca.Function("nlp_jac_g", [x, p], [g, jac], ["x", "p"], ["g", "jac_g_x"]),
-            "hess_lag": ca.Function(
-                "nlp_hess_l", [x, p, lam_f, lam_g], [hess], ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
-            ),
+            "grad_f": ca.Function("nlp_grad_f", [x, p], [f, ca.densify(grad)]),
+            "jac_g": ca.Function("nlp_jac_g", [x, p], [g, jac]),
+            "hess_lag": ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [hess]),
             "print_time": False,
             "ipopt.sb": "yes",
             "ipopt.print_level": 0,
@@ -216,8 +227,14 @@ class Program:
         row_lower, row_upper, names = self.row_bounds()
         p = np.asarray(parameters, dtype=float) if len(parameters) else np.zeros(1)
         begin, cpu = time.perf_counter(), time.process_time()
-        arguments = {"x0": np.clip(guess / scale, lower, upper), "p": p, "lbx": lower, "ubx": upper,
-                     "lbg": row_lower, "ubg": row_upper}
+        arguments = {
+            "x0": np.clip(guess / scale, lower, upper),
+            "p": p,
+            "lbx": lower,
+            "ubx": upper,
+            "lbg": row_lower,
+            "ubg": row_upper,
+        }
         if multipliers is not None:
             arguments["lam_g0"] = multipliers
         out = solver(**arguments)

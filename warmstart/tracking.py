@@ -17,6 +17,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -36,34 +37,6 @@ from warmstart.solution import Solution
 
 _VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 _State = tuple[np.ndarray, np.ndarray, np.ndarray]  # qpos, qvel, the solver's warm start
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Cost per control step of a candidate; each term is a mean over links or dofs."""
-
-    link_position: float = 60.0
-    """Per m^2 of distance of the links from the reference's, in the world."""
-    link_rotation: float = 3.0
-    """Per rad^2 (small angles) of the links' attitude."""
-    com_position: float = 100.0
-    """Per m^2 of distance of the centre of mass: it decides height and length."""
-    momentum: float = 10.0
-    """Per (m/s)^2 of the centre of mass's velocity: the flight is decided at take-off."""
-    spin: float = 0.02
-    """Per (kg m^2/s)^2 of angular momentum about the centre of mass: so is its rotation."""
-    joint_rate: float = 0.003
-    """Per (rad/s)^2."""
-    effort: float = 0.05
-    """Per squared share of the servo's range by which targets leave the reference's."""
-    bar: float = 400.0
-    """Per m by which the bar has moved."""
-    foul: float = 400.0
-    """Per m by which a contact before the take-off lies beyond the line."""
-    mark: float = 100.0
-    """Per m by which a contact after the landing lies behind the asked mark."""
-    after: float = 0.02
-    """Share of the tracking terms that counts after the reference has ended."""
 
 
 @dataclass(frozen=True)
@@ -98,54 +71,10 @@ class Tracked:
     """Largest distance of the root from the reference's (m)."""
     seconds: float
 
-
-@dataclass(frozen=True)
-class _Reference:
-    """Kinematics of the reference at the control rate, T frames."""
-
-    qpos: np.ndarray
-    qvel: np.ndarray
-    ctrl: np.ndarray
-    link_pos: np.ndarray  # (T, B, 3)
-    link_quat: np.ndarray  # (T, B, 4)
-    whole: np.ndarray  # (T, 9) centre of mass, its velocity, angular momentum about it
-
-    def held(self, frames: int) -> _Reference:
-        """With the last frame repeated: where a task needs to see what comes after."""
-
-        def hold(x: np.ndarray) -> np.ndarray:
-            return np.concatenate([x, np.repeat(x[-1:], frames, axis=0)])
-
-        return _Reference(*(hold(getattr(self, f.name)) for f in fields(self)))
-
-
-@dataclass(frozen=True)
-class _JumpRules:
-    """Contacts that the long jump punishes, from the links' support points."""
-
-    takeoff: int
-    """Frame of the reference from which it flies."""
-    mark: float
-    """x at which the jump is to be measured (m)."""
-    geometry: Geometry
-    weights: Weights
-
-    AFTER = long_jump.MARK_STEPS + 3
-    """Frames that are planned beyond the reference, in which marks count."""
-
-    def cost(self, at: int, pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
-        """(N,) of links at pos (N, B, 3), quat (N, B, 4) at a frame."""
-        links = (torch.from_numpy(x.astype(np.float32)) for x in (pos, quat))
-        points = self.geometry.world_points(*links)
-        height = (points[..., 2] - self.geometry.radii).numpy()
-        x = points[..., 0].numpy()
-        if at <= self.takeoff:
-            beyond = np.where(height < 0.01, x - long_jump.LINE_X + 0.01, 0.0)
-            return self.weights.foul * np.maximum(beyond.max(1), 0.0)
-        # Near the ground counts in part, so that candidates see a slope before they touch.
-        near = np.clip(1.0 - height / 0.15, 0.0, 1.0)
-        behind = np.maximum(self.mark - x, 0.0) * near
-        return self.weights.mark * behind.max(1) if at > self.takeoff + 4 else np.zeros(len(x))
+    @property
+    def success(self) -> bool:
+        """Whether the task called the motion a success."""
+        return self.clip.meta.get("achieved", {}).get("success") == 1.0
 
 
 class _Worlds:
@@ -168,7 +97,8 @@ class _Worlds:
         bind = self.batch.bind
         self.qpos, self.qvel, self.ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
         self.warm = bind("qacc_warmstart")
-        self.xpos, self.xquat, self.whole = bind("xpos"), bind("xquat"), bind("sensordata")
+        self.xpos, self.xquat, self.xmat = bind("xpos"), bind("xquat"), bind("xmat")
+        self.whole = bind("sensordata")
         self.links = np.array(
             [self.model.body(f"agent0/{name}").id for name in scene.body.link_names]
         )
@@ -223,8 +153,8 @@ def track(
     frames = _reference(clip, worlds)
     steps, rules = len(frames.ctrl) - 1, None
     if clip.meta.get("problem") == "long_jump":
-        rules = _jump_rules(clip, scene, settings.weights)
-        frames = frames.held(_JumpRules.AFTER)
+        rules = jump_rules(clip, scene, settings.weights)
+        frames = frames.held(JumpRules.AFTER)
     qpos, qvel, ctrl = _follow(frames, steps, worlds, settings, rules, progress)
     tracked = replace(
         clip,
@@ -248,94 +178,46 @@ def track(
     )
 
 
-def scene_options(clip: Clip) -> dict[str, Any]:
-    """The options of the clip's task that its ``asked`` outcome sets (``bar_height``)."""
-    asked = clip.meta.get("asked")
-    known = ("bar_height",)
-    return {k: asked[k] for k in known if isinstance(asked, dict) and k in asked}
+def track_best(
+    reference: Clip | Solution,
+    settings: Tracking | None = None,
+    *,
+    attempts: int = 3,
+    threads: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Tracked:
+    """Tracks in the task's scene until the task calls it a success: the first that succeeds, else
+    the best of all ``attempts``.
 
-
-def body_of(clip: Clip) -> Body:
-    """The athlete of a clip at the strength its metadata names (``paper`` without one)."""
-    return load_body(clip.body, strength=clip.meta.get("strength", "paper"))
-
-
-def scene_of(clip: Clip) -> Scene:
-    """The scene of the clip's problem, or the athlete alone where no task has that name."""
-    problem = clip.meta.get("problem")
-    if problem in task_names():
-        return make_scene(
-            problem, strength=clip.meta.get("strength", "paper"), options=scene_options(clip)
-        )
-    return humanoid_scene(body_of(clip))
-
-
-def play(
-    clip: Clip, task: str, options: dict[str, Any], body: Body, timestep_divisor: int = 1
-) -> tuple[Clip, dict[str, float]]:
-    """Plays the clip's targets open loop from its first frame in the task's environment.
-
-    Returns the motion that came out, at the control rate until the task ended the episode, and
-    the task's metrics at that moment (those that are not NaN). The environment rounds states to
-    float32 and its actions are limited, exactly as in training.
+    Each attempt draws other noise, the later ones more of it. Raises ValueError for a reference
+    whose problem is no task, RuntimeError when every attempt diverged.
     """
-    assert clip.ctrl is not None
-    starts = Starts(
-        qpos=torch.tensor(clip.qpos[:1], dtype=torch.float32),
-        qvel=torch.tensor(clip.qvel[:1], dtype=torch.float32),
-        context={},
-        probability=1.0,
-    )
-    env = make_env(
-        task,
-        num_worlds=1,
-        strength=body.strength,
-        limits=body.limits,
-        training=False,
-        options=options,
-        starts=starts,
-        timestep_divisor=timestep_divisor,
-    )
-    env.keep_snapshot = True
-    q, v = env.physics.scene.agent_qpos(0), env.physics.scene.agent_qvel(0)
-    qpos, qvel, ctrl, metrics = [clip.qpos[0]], [clip.qvel[0]], [], {}
-    for step in range(env.max_steps):
-        target = clip.ctrl[min(step, len(clip.ctrl) - 1)]
-        action = torch.tensor(target / body.action_scale(), dtype=torch.float32)
-        result = env.step(action[None, None])
-        ctrl.append(target)
-        metrics = {k: float(m[0]) for k, m in result.metrics.items()}
-        if not bool(result.valid[0]):
-            raise RuntimeError(f"the simulation diverged at step {step} of the replayed clip")
-        qpos.append(env.final_snapshot["qpos"][0, q].double().numpy())
-        qvel.append(env.final_snapshot["qvel"][0, v].double().numpy())
-        if bool(result.terminated[0] | result.truncated[0]):
-            break
-    rate = 1.0 / env.physics.scene.control_timestep
-    env.close()
-    ctrl.append(ctrl[-1])
-    out = replace(
-        clip,
-        fps=rate,
-        qpos=np.array(qpos),
-        qvel=np.array(qvel),
-        ctrl=np.array(ctrl),
-        meta=dict(clip.meta),
-    )
-    return out, {k: m for k, m in metrics.items() if np.isfinite(m)}
+    settings = settings or Tracking()
+    clip = clip_from_solution(reference) if isinstance(reference, Solution) else reference
+    if clip.meta.get("problem") not in task_names():
+        raise ValueError(
+            f"the clip's problem {clip.meta.get('problem')!r} is no task to succeed in"
+        )
+    best, reason = None, ""
+    for attempt in range(attempts):
+        drawn = replace(
+            settings, seed=settings.seed + attempt, noise=settings.noise * (1 + 0.5 * (attempt % 3))
+        )
+        try:
+            found = track(clip, settings=drawn, threads=threads, progress=progress)
+        except RuntimeError as error:
+            reason = str(error)
+            continue
+        if best is None or (found.success, -found.link_error) > (best.success, -best.link_error):
+            best = found
+        if best.success:
+            return best
+    if best is None:
+        raise RuntimeError(f"none of {attempts} attempts could be simulated: {reason}")
+    return best
 
 
-def _jump_rules(clip: Clip, scene: Scene, weights: Weights) -> _JumpRules:
-    events, asked = clip.meta.get("events", {}), clip.meta.get("asked", {})
-    return _JumpRules(
-        takeoff=math.ceil(float(events.get("takeoff", 0.0)) / scene.control_timestep),
-        mark=long_jump.LINE_X + float(asked.get("length", 0.0)),
-        geometry=Geometry(scene.body, "cpu"),
-        weights=weights,
-    )
-
-
-def _reference(clip: Clip, worlds: _Worlds) -> _Reference:
+def _reference(clip: Clip, worlds: _Worlds) -> Reference:
     scene = worlds.scene
     rate = 1.0 / scene.control_timestep
     if abs(clip.fps - rate) > 1e-6:
@@ -343,7 +225,7 @@ def _reference(clip: Clip, worlds: _Worlds) -> _Reference:
     limit = scene.body.action_scale()
     ctrl = clip.ctrl if clip.ctrl is not None else clip.qpos[:, 7:]
     kinematics = worlds.kinematics(clip.qpos, clip.qvel)
-    return _Reference(clip.qpos, clip.qvel, np.clip(ctrl, -limit, limit), *kinematics)
+    return Reference(clip.qpos, clip.qvel, np.clip(ctrl, -limit, limit), *kinematics)
 
 
 def _spline(knots: np.ndarray, steps: int, every: int) -> np.ndarray:
@@ -355,11 +237,11 @@ def _spline(knots: np.ndarray, steps: int, every: int) -> np.ndarray:
 
 
 def _follow(
-    frames: _Reference,
+    frames: Reference,
     end: int,
     worlds: _Worlds,
     settings: Tracking,
-    rules: _JumpRules | None,
+    rules: JumpRules | None,
     progress: Callable[[int, int], None] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The receding horizon loop: qpos (T, 7 + n), qvel (T, 6 + n) and ctrl (T, n)."""
@@ -416,14 +298,14 @@ def _follow(
 
 
 def _rollout(
-    frames: _Reference,
+    frames: Reference,
     end: int,
     worlds: _Worlds,
     targets: np.ndarray,
     now: int,
     state: _State,
     weights: Weights,
-    rules: _JumpRules | None,
+    rules: JumpRules | None,
 ) -> np.ndarray:
     """(N,) cost of N target sequences (N, H, n) from one state."""
     scene = worlds.scene
@@ -451,7 +333,8 @@ def _rollout(
         if at > end:
             step *= weights.after
         if rules is not None:
-            step += rules.cost(at, pos, quat)
+            mat = worlds.xmat[:count, worlds.links].reshape(count, -1, 3, 3)
+            step += rules.cost(at, pos, mat)
         if bar is not None:
             shift = np.linalg.norm(
                 worlds.qpos[:count, bar][:, :3] - scene.default_qpos()[bar][:3], axis=1

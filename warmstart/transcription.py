@@ -14,7 +14,7 @@ its points is zero, which makes accelerations and torques continuous across phas
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -43,6 +43,13 @@ class Phase:
     """Shortest and longest duration (s)."""
     feet: Mapping[str, str] = field(default_factory=dict)
     """Contact mode by side, e.g. ``{"L": "flat"}``; modes: ``flat``, ``toe``."""
+    grading: float = 1.0
+    """Length of the last interval over the first: small steps where motion is abrupt."""
+
+    def spacing(self) -> np.ndarray:
+        """(intervals,) lengths relative to their mean, growing geometrically."""
+        w = np.geomspace(1.0, self.grading, self.intervals)
+        return w / w.mean()
 
 
 @dataclass(frozen=True)
@@ -50,13 +57,13 @@ class Weights:
     """Cost weights. Effort is the integral of the squared torque over its limit."""
 
     effort: float = 1.0
-    torque_rate: float = 1e-3
+    torque_rate: float = 3e-3
     """On the integral of the squared rate of torque over its limit (per s)."""
     force_rate: float = 2e-4
     """On the integral of the squared rate of force over body weight (per s)."""
     acceleration: float = 2e-3
     """On the integral of squared joint acceleration over 50 rad/s^2."""
-    acceleration_rate: float = 5e-5
+    acceleration_rate: float = 2e-4
     """On the integral of the squared rate of joint acceleration over 50 rad/s^2 (per s)."""
 
 
@@ -138,6 +145,10 @@ class Transcription:
     def interval_phase(self) -> np.ndarray:
         """(K-1,) phase of each interval."""
         return np.repeat(np.arange(len(self.phases)), [p.intervals for p in self.phases])
+
+    def spacing(self) -> np.ndarray:
+        """(K-1,) length of each interval over the mean of its phase."""
+        return np.concatenate([p.spacing() for p in self.phases])
 
     # -- variables ---------------------------------------------------------------------------
     def _box(self, boxes: Mapping[str, tuple[float, float]], default: float):
@@ -228,7 +239,7 @@ class Transcription:
     def _add_dynamics(self) -> None:
         """Root wrench zero, joint torque = u - kd v, friction cones; limits of held joints in
         stance, where they matter."""
-        model, n = self.model, self.model.n
+        model = self.model
         tree = model.tree
         damping = ca.DM(tree.damping[model.free_index])
         effort = ca.DM(self.effort)
@@ -244,7 +255,7 @@ class Transcription:
                 forces, rows = [], []
                 if points:
                     f = ca.reshape(rest[0], 3, len(points))
-                    forces = [(tree.link(l), p, f[:, i]) for i, (l, p) in enumerate(points)]
+                    forces = [(tree.link(link), p, f[:, i]) for i, (link, p) in enumerate(points)]
                     fx, fy, fz = (f[i, :].T / self.weight for i in range(3))
                     mx, my = self.bounds.friction_x, self.bounds.friction_y
                     cone = ca.vertcat(fx - mx * fz, -fx - mx * fz, fy - my * fz, -fy - my * fz)
@@ -271,9 +282,10 @@ class Transcription:
 
     def _add_intervals(self) -> None:
         """Integration defects and the running cost."""
-        w, n, effort = self.weights, self.model.n, ca.DM(self.effort)
+        w, effort = self.weights, ca.DM(self.effort)
 
         def build(q0, v0, a0, u0, q1, v1, a1, u1, h, p):
+            h = h * p[-1]
             rows = [
                 ("velocity", (v1 - v0 - h / 2 * (a0 + a1)) / 0.5, 0.0, 0.0),
                 ("position", (q1 - q0 - h * v0 - h**2 / 6 * (2 * a0 + a1)) / 0.1, 0.0, 0.0),
@@ -289,16 +301,17 @@ class Transcription:
         k = np.arange(self.K - 1)
         h = self.h[self.interval_phase()][:, None]
         inputs = [x[k + i] for i in (0, 1) for x in (self.q, self.v, self.a, self.u)]
-        self.program.block("interval", [*inputs, h], build)
+        spacing = self.spacing()[:, None]
+        self.program.block("interval", [*inputs, h], build, spacing)
         for side in self.sides:
             pairs = [k for k in self.f[side] if k + 1 in self.f[side]]
 
             def force_rate(f0, f1, h, p):
-                return w.force_rate * ca.sumsqr((f1 - f0) / self.weight) / h, []
+                return w.force_rate * ca.sumsqr((f1 - f0) / self.weight) / (h * p[-1]), []
 
             f0 = np.array([self.f[side][k].ravel() for k in pairs])
             f1 = np.array([self.f[side][k + 1].ravel() for k in pairs])
-            self.program.block(f"force rate {side}", [f0, f1, h[pairs]], force_rate)
+            self.program.block(f"force rate {side}", [f0, f1, h[pairs]], force_rate, spacing[pairs])
 
     def _add_contacts(self) -> None:
         """Placement at the first knot of a contact, then no motion of the toe link."""
@@ -364,7 +377,7 @@ class Transcription:
     def guess(self, q: np.ndarray, durations: Sequence[float]) -> np.ndarray:
         """A start point from positions (K, n) and phase durations (s)."""
         h = np.array([d / p.intervals for d, p in zip(durations, self.phases, strict=True)])
-        t = np.concatenate([[0.0], np.cumsum(h[self.interval_phase()])])
+        t = self._times(h)
         v = np.gradient(q, t, axis=0)
         x = np.zeros(len(self.program.lower))
         x[self.q], x[self.v], x[self.h] = q, v, h
@@ -388,7 +401,9 @@ class Transcription:
             )
         t, h = [], []
         for i, (_, k0, k1, _) in enumerate(solution.phases):
-            knots = np.linspace(solution.times[k0], solution.times[k1], self.phases[i].intervals + 1)
+            steps = np.concatenate([[0.0], np.cumsum(self.phases[i].spacing())])
+            share = np.minimum(steps / self.phases[i].intervals, 1.0)
+            knots = solution.times[k0] + share * (solution.times[k1] - solution.times[k0])
             t.extend(knots if i == 0 else knots[1:])
             h.append((knots[-1] - knots[0]) / self.phases[i].intervals)
         s = solution.sample(np.array(t))
@@ -406,14 +421,22 @@ class Transcription:
 
     def times(self, x: np.ndarray) -> np.ndarray:
         """(K,) knot times of a point of the program (s)."""
-        return np.concatenate([[0.0], np.cumsum(x[self.h][self.interval_phase()])])
+        return self._times(x[self.h])
+
+    def _times(self, h: np.ndarray) -> np.ndarray:
+        return np.concatenate([[0.0], np.cumsum(h[self.interval_phase()] * self.spacing())])
+
+    def nominal_times(self, durations: Sequence[float]) -> np.ndarray:
+        """(K,) knot times (s) for given phase durations (s)."""
+        pairs = zip(durations, self.phases, strict=True)
+        return self._times(np.array([d / p.intervals for d, p in pairs]))
 
     def full_torque(self, x: np.ndarray) -> np.ndarray:
         """(K, num_dofs) servo torque of all joints, held ones by inverse dynamics (N m)."""
         model, points = self.model, [p for s in self.sides for p in sole_points(self.body, s)]
         q, v, a = (ca.SX.sym(name, model.n) for name in "qva")
         f = ca.SX.sym("f", 3, len(points))
-        forces = [(model.tree.link(l), p, f[:, i]) for i, (l, p) in enumerate(points)]
+        forces = [(model.tree.link(link), p, f[:, i]) for i, (link, p) in enumerate(points)]
         tau = ca.Function("tau", [q, v, a, f], [model.inverse_dynamics(q, v, a, forces)])
         force = self.forces(x)
         torque = np.zeros((self.K, model.tree.num_dofs))
@@ -467,6 +490,7 @@ class Transcription:
                 "objective": result.objective,
                 "status": result.status,
                 "variables": len(self.program.lower),
+                "weights": asdict(self.weights),
                 **stats,
             },
         )

@@ -73,7 +73,7 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     phases = [
         Phase("flat", 14, (0.09, 0.30), {"L": "flat"}),
         Phase("toe", 8, (0.04, 0.15), {"L": "toe"}),
-        Phase("flight", 34, (0.30, 1.20)),
+        Phase("flight", 36, (0.30, 1.20), grading=3.0),
     ]
     position = jumper.boxes(jumper.POSITION) | {
         "x": (BAR_X - 5, BAR_X + 3),
@@ -102,10 +102,12 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
         ]
         return [("bar clearance", ca.vertcat(*gaps), 0.0, np.inf)]
 
-    program.rows("bar", flight[1:], clear)
+    air = np.concatenate([program.knots("toe")[1:], flight[1:]])
+    program.rows("bar", air, clear)
     left, right = jumper.foot(body, "L"), jumper.foot(body, "R")
     program.ground(right, np.arange(program.K - 1))
-    program.ground(left, flight[3:])
+    program.ground(left, flight[1:4], margin=0.0)
+    program.ground(left, flight[4:])
 
     def land(q, p):
         motion = model.motion(q)
@@ -125,8 +127,7 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
 def first_guess(program: Transcription, bar_height: float) -> np.ndarray:
     """Key poses of a tucked hurdle-style jump along a ballistic root path."""
     durations = (0.15, 0.07, 0.65)
-    h = np.array([d / p.intervals for d, p in zip(durations, program.phases, strict=True)])
-    t = np.concatenate([[0.0], np.cumsum(h[program.interval_phase()])])
+    t = program.nominal_times(durations)
     arms = [{"L_Shoulder_z": -s, "R_Shoulder_z": s} for s in (-0.5, 0.0, 0.8, 1.0, 0.5, 0.0)]
     frames = [
         jumper.legs((-0.5, 0.4, 0.2, 0), (0.3, 1.2, 0, 0), pitch=-0.1, **arms[0]),
@@ -158,9 +159,7 @@ def solve(
     def attempt(elastic: bool) -> tuple[Transcription, Result]:
         program = transcribe(config, elastic)
         start = (
-            first_guess(program, config.bar_height)
-            if guess is None
-            else program.guess_from(guess)
+            first_guess(program, config.bar_height) if guess is None else program.guess_from(guess)
         )
         parameters = [config.bar_height + config.clearance]
         return program, jumper.run(

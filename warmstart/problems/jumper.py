@@ -30,7 +30,7 @@ POSE = {"L_Shoulder_x": -1.25, "R_Shoulder_x": 1.25, "L_Elbow_z": -1.0, "R_Elbow
 HELD_LIMITS = (
     *(f"{side}_Knee_{axis}" for side in "LR" for axis in "xz"),
     *(f"{side}_Thorax_{axis}" for side in "LR" for axis in "xyz"),
-    *(f"{side}_Toe_{axis}" for side in "LR" for axis in "xz"),
+    *(f"{side}_{dof}" for side in "LR" for dof in ("Ankle_z", "Toe_x", "Toe_z")),
     *("Torso_z", "Spine_x", "Spine_y", "Spine_z", "Chest_x", "Chest_z"),
     *("Neck_y", "Head_y"),
 )
@@ -64,6 +64,7 @@ RATE = {
     "yaw": (-4.0, 4.0),
 }
 """Rate boxes of the root (m/s, rad/s)."""
+
 
 def make_model(body: Body) -> ReducedModel:
     """The athlete of both jumps: 6 + 19 coordinates."""
@@ -193,8 +194,12 @@ def run(
     """Solves a transcribed jump; a neighbour's solution starts with a small barrier."""
     options = {"ipopt.max_iter": max_iterations, **(options or {})}
     if neighbour:
-        options |= {"ipopt.mu_strategy": "monotone", "ipopt.mu_init": 1e-3,
-                    "ipopt.bound_push": 1e-4, "ipopt.bound_frac": 1e-4}
+        options |= {
+            "ipopt.mu_strategy": "monotone",
+            "ipopt.mu_init": 1e-3,
+            "ipopt.bound_push": 1e-4,
+            "ipopt.bound_frac": 1e-4,
+        }
     callback = _Progress(program, progress) if progress else None
     if callback:
         options["iteration_callback"] = callback

@@ -61,12 +61,12 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     phases = [
         Phase("flat", 14, (0.06, 0.25), {"L": "flat"}),
         Phase("toe", 8, (0.03, 0.12), {"L": "toe"}),
-        Phase("flight", 36, (0.25, 1.20)),
+        Phase("flight", 52, (0.25, 1.20), grading=2.0),
     ]
     position = jumper.boxes(jumper.POSITION) | {
         "x": (LINE_X - 3, LINE_X + 12),
         "y": (-0.5, 0.5),
-        "z": (0.4, 2.5),
+        "z": (0.5, 2.5),
         "pitch": (-0.7, 1.2),
     }
     program = Transcription(
@@ -90,7 +90,8 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     program.rows("board", [0], behind_line)
     flight = program.knots("flight")
     program.ground(right, np.arange(program.K - 1))
-    program.ground(left, flight[3:-1])
+    program.ground(left, flight[1:4], margin=0.0)
+    program.ground(left, flight[4:-1])
     rest = [
         b
         for b in outline(body, sagittal=True)
@@ -105,7 +106,8 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
             for b in left + right
         ]
         heels = [
-            s for s, b in zip(soles, left + right, strict=True)
+            s
+            for s, b in zip(soles, left + right, strict=True)
             if b.link.endswith("Ankle") and b.center[0] < 0
         ]
         com, velocity = center_of_mass(model.tree, motion)
@@ -116,7 +118,7 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
             ("toes beyond the length", ca.vertcat(*[s[0] for s in soles]), 0.0, np.inf),
             ("body behind the feet", LINE_X + p[0] - com[0], -0.2, 0.75),
             ("carried forward", velocity[0], 1.5, np.inf),
-            ("trunk over the legs", com[2], 0.45, 1.3),
+            ("trunk over the legs", com[2], 0.60, 1.3),
         ]
 
     program.rows("landing", [program.K - 1], land, rates=True)
@@ -127,8 +129,7 @@ def first_guess(program: Transcription, length: float) -> np.ndarray:
     """Key poses of a sail-style jump along a ballistic root path."""
     off, air = 0.16, 0.33 + 0.06 * length
     durations = (0.10, off - 0.10, air)
-    h = np.array([d / p.intervals for d, p in zip(durations, program.phases, strict=True)])
-    t = np.concatenate([[0.0], np.cumsum(h[program.interval_phase()])])
+    t = program.nominal_times(durations)
     arms = [{"L_Shoulder_z": -s, "R_Shoulder_z": s} for s in (-0.4, 0.0, 0.6, 1.5, 1.0, 0.6)]
     frames = [
         jumper.legs((-0.5, 0.35, 0.2, 0), (0.2, 1.4, 0, 0), pitch=-0.05, **arms[0]),
@@ -160,9 +161,7 @@ def solve(
 
     def attempt(elastic: bool) -> tuple[Transcription, Result]:
         program = transcribe(config, elastic)
-        start = (
-            first_guess(program, config.length) if guess is None else program.guess_from(guess)
-        )
+        start = first_guess(program, config.length) if guess is None else program.guess_from(guess)
         return program, jumper.run(
             program, start, [config.length], guess is not None, progress, config.max_iterations
         )

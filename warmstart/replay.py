@@ -1,0 +1,134 @@
+"""A motion put back into simulation: a solution's torques, a clip's targets.
+
+:func:`replay` plays a solution open loop on any engine; :func:`play` plays a clip in its task's
+environment, where the task's own rules measure what it achieves.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from sports.env import Starts, make_env, make_scene
+from sports.humanoid.body import Body, load_body
+from sports.physics import PhysicsState, make_physics
+from sports.registry import task_names
+from sports.scene import Scene, humanoid_scene
+from warmstart.clip import Clip
+from warmstart.solution import Solution
+
+REPLAY_RATE = 480.0
+"""Control and simulation rate of an open-loop replay (Hz)."""
+
+
+def replay(
+    solution: Solution, engine: str, hold: float = 0.5, scene: Scene | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Plays the torques open loop at ``REPLAY_RATE``: targets q + torque / kp, clipped by the
+    servo, then the last targets for ``hold`` s. The athlete is alone on the ground.
+
+    Returns times (T,) s from the first frame and qpos (T, 7 + n). Raises RuntimeError when the
+    simulation diverges.
+    """
+    scene = scene or humanoid_scene(solution.body, timestep=1.0 / REPLAY_RATE, substeps=1)
+    physics = make_physics(engine, scene, 1)
+    planned = math.floor(solution.duration * REPLAY_RATE)
+    steps = planned + round(hold * REPLAY_RATE)
+    middle = np.minimum((np.arange(steps) + 0.5) / REPLAY_RATE, solution.duration)
+    motion = solution.sample(solution.times[0] + middle)
+    targets = motion["qpos"][:, 7:] + motion["torque"] / solution.body.array("kp")
+    state = PhysicsState(
+        torch.tensor(solution.qpos[:1], dtype=torch.float32),
+        torch.tensor(solution.qvel[:1], dtype=torch.float32),
+        torch.zeros(1, 0, 3),
+    )
+    physics.reset(torch.ones(1, dtype=torch.bool), state)
+    out = [physics.qpos[0].double().numpy().copy()]
+    for target in targets:
+        physics.step(torch.tensor(target[None], dtype=torch.float32))
+        if bool(physics.bad.any()):
+            raise RuntimeError(f"the replay diverged in {engine} after {len(out)} steps")
+        out.append(physics.qpos[0].double().numpy().copy())
+    physics.close()
+    return np.arange(len(out)) / REPLAY_RATE, np.array(out)
+
+
+def scene_options(clip: Clip) -> dict[str, Any]:
+    """The options of the clip's task that its ``asked`` outcome sets (``bar_height``)."""
+    asked = clip.meta.get("asked")
+    known = ("bar_height",)
+    return {k: asked[k] for k in known if isinstance(asked, dict) and k in asked}
+
+
+def body_of(clip: Clip) -> Body:
+    """The athlete of a clip at the strength its metadata names (``paper`` without one)."""
+    return load_body(clip.body, strength=clip.meta.get("strength", "paper"))
+
+
+def scene_of(clip: Clip) -> Scene:
+    """The scene of the clip's problem, or the athlete alone where no task has that name."""
+    problem = clip.meta.get("problem")
+    if problem in task_names():
+        return make_scene(
+            problem, strength=clip.meta.get("strength", "paper"), options=scene_options(clip)
+        )
+    return humanoid_scene(body_of(clip))
+
+
+def play(
+    clip: Clip, task: str, options: dict[str, Any], body: Body, timestep_divisor: int = 1
+) -> tuple[Clip, dict[str, float]]:
+    """Plays the clip's targets open loop from its first frame in the task's environment.
+
+    Returns the motion that came out, at the control rate until the task ended the episode, and
+    the task's metrics at that moment (those that are not NaN). The environment rounds states to
+    float32 and its actions are limited, exactly as in training.
+    """
+    assert clip.ctrl is not None
+    starts = Starts(
+        qpos=torch.tensor(clip.qpos[:1], dtype=torch.float32),
+        qvel=torch.tensor(clip.qvel[:1], dtype=torch.float32),
+        context={},
+        probability=1.0,
+    )
+    env = make_env(
+        task,
+        num_worlds=1,
+        strength=body.strength,
+        limits=body.limits,
+        training=False,
+        options=options,
+        starts=starts,
+        timestep_divisor=timestep_divisor,
+    )
+    env.keep_snapshot = True
+    q, v = env.physics.scene.agent_qpos(0), env.physics.scene.agent_qvel(0)
+    qpos, qvel, ctrl, metrics = [clip.qpos[0]], [clip.qvel[0]], [], {}
+    for step in range(env.max_steps):
+        target = clip.ctrl[min(step, len(clip.ctrl) - 1)]
+        action = torch.tensor(target / body.action_scale(), dtype=torch.float32)
+        result = env.step(action[None, None])
+        ctrl.append(target)
+        metrics = {k: float(m[0]) for k, m in result.metrics.items()}
+        if not bool(result.valid[0]):
+            raise RuntimeError(f"the simulation diverged at step {step} of the replayed clip")
+        qpos.append(env.final_snapshot["qpos"][0, q].double().numpy())
+        qvel.append(env.final_snapshot["qvel"][0, v].double().numpy())
+        if bool(result.terminated[0] | result.truncated[0]):
+            break
+    rate = 1.0 / env.physics.scene.control_timestep
+    env.close()
+    ctrl.append(ctrl[-1])
+    out = replace(
+        clip,
+        fps=rate,
+        qpos=np.array(qpos),
+        qvel=np.array(qvel),
+        ctrl=np.array(ctrl),
+        meta=dict(clip.meta),
+    )
+    return out, {k: m for k, m in metrics.items() if np.isfinite(m)}

@@ -1,0 +1,109 @@
+"""What tracking wants: links, centre of mass and momentum as in the reference, and a legal jump."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+
+from sports import long_jump
+from sports.humanoid.body import Body
+from sports.physics.base import Geometry
+from sports.scene import Scene
+from warmstart.clip import Clip
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Cost per control step of a candidate; each term is a mean over links or dofs."""
+
+    link_position: float = 60.0
+    """Per m^2 of distance of the links from the reference's, in the world."""
+    link_rotation: float = 3.0
+    """Per rad^2 (small angles) of the links' attitude."""
+    com_position: float = 100.0
+    """Per m^2 of distance of the centre of mass: it decides height and length."""
+    momentum: float = 10.0
+    """Per (m/s)^2 of the centre of mass's velocity: the flight is decided at take-off."""
+    spin: float = 0.02
+    """Per (kg m^2/s)^2 of angular momentum about the centre of mass: so is its rotation."""
+    joint_rate: float = 0.003
+    """Per (rad/s)^2."""
+    effort: float = 0.05
+    """Per squared share of the servo's range by which targets leave the reference's."""
+    bar: float = 400.0
+    """Per m by which the bar has moved."""
+    foul: float = 400.0
+    """Per m by which a contact before the take-off lies beyond the line."""
+    mark: float = 100.0
+    """Per m by which a contact after the landing lies behind the asked mark."""
+    after: float = 0.02
+    """Share of the tracking terms that counts after the reference has ended."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Kinematics of the reference at the control rate, T frames."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    ctrl: np.ndarray
+    link_pos: np.ndarray  # (T, B, 3)
+    link_quat: np.ndarray  # (T, B, 4)
+    whole: np.ndarray  # (T, 9) centre of mass, its velocity, angular momentum about it
+
+    def held(self, frames: int) -> Reference:
+        """With the last frame repeated: where a task needs to see what comes after."""
+
+        def hold(x: np.ndarray) -> np.ndarray:
+            return np.concatenate([x, np.repeat(x[-1:], frames, axis=0)])
+
+        return Reference(*(hold(getattr(self, f.name)) for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class JumpRules:
+    """Contacts that the long jump punishes, from the links' support points."""
+
+    takeoff: int
+    """Frame of the reference from which it flies."""
+    mark: float
+    """x at which the jump is to be measured (m)."""
+    body: Body
+    weights: Weights
+
+    AFTER = long_jump.MARK_STEPS + 3
+    """Frames that are planned beyond the reference, in which marks count."""
+
+    @cached_property
+    def _points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Support points (K, 3) in their links' frames, radii (K,) and link indices (K,)."""
+        geometry = Geometry(self.body, "cpu")
+        return geometry.points.numpy(), geometry.radii.numpy(), geometry.owner.numpy()
+
+    def cost(self, at: int, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
+        """(N,) of links at pos (N, B, 3) with rotation matrices mat (N, B, 3, 3) at a frame."""
+        points, radii, owner = self._points
+        x, height = (
+            pos[:, owner, i] + np.einsum("nkj,kj->nk", mat[:, owner, i], points) for i in (0, 2)
+        )
+        height = height - radii
+        if at <= self.takeoff:
+            beyond = np.where(height < 0.01, x - long_jump.LINE_X + 0.01, 0.0)
+            return self.weights.foul * np.maximum(beyond.max(1), 0.0)
+        # Near the ground counts in part, so that candidates see a slope before they touch.
+        near = np.clip(1.0 - height / 0.15, 0.0, 1.0)
+        behind = np.maximum(self.mark - x, 0.0) * near
+        return self.weights.mark * behind.max(1) if at > self.takeoff + 4 else np.zeros(len(x))
+
+
+def jump_rules(clip: Clip, scene: Scene, weights: Weights) -> JumpRules:
+    events, asked = clip.meta.get("events", {}), clip.meta.get("asked", {})
+    return JumpRules(
+        takeoff=math.ceil(float(events.get("takeoff", 0.0)) / scene.control_timestep),
+        mark=long_jump.LINE_X + float(asked.get("length", 0.0)),
+        body=scene.body,
+        weights=weights,
+    )
