@@ -220,17 +220,23 @@ def _font(size: int) -> Any:
 
 
 def _number(value: float) -> str:
+    if not math.isfinite(value):
+        return "–"
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 
 def _title(episode: Episode, label: str, commit: str) -> str:
-    parts = [label, episode.task, f"seed {episode.seed}", f"world {episode.world}"]
+    parts = [label, episode.task]
+    for name in ("engine", "strength"):
+        value = getattr(episode, name, "")
+        parts += [f"strength {value}" if name == "strength" else value] if value else []
+    parts += [f"seed {episode.seed}", f"world {episode.world}"]
     parts += [f"commit {commit}"] if commit else []
     return "  ·  ".join(parts)
 
 
 def _panel(
-    player: Player, window: Window, frame: int, view: View, marks: list, touch: list[str]
+    player: Player, window: Window, frame: int, view: View, marks: list, touch: list[str] | None
 ) -> Any:
     """One frame with its captions, as a PIL image."""
     from PIL import Image, ImageDraw
@@ -255,9 +261,9 @@ def _panel(
             nearest = max(view.project(np.array([*c, 0.0]))[1] for c in mark.corners)
             ink.text((at[0], min(nearest + 2, view.height_px - 16)), mark.label, font=small,
                      fill=(90, 80, 60), anchor="ma")  # fmt: skip
-    words = "ground: " + ", ".join(touch) if touch else "in the air"
+    words = "" if touch is None else "ground: " + ", ".join(touch) if touch else "in the air"
     if frame == window.landing:
-        words += "  (landing)"
+        words = f"{words}  (landing)".strip()
     tone = (150, 30, 20) if touch else dark
     at = (8, view.height_px - 20)
     ink.text(at, words, font=small, fill=tone, stroke_width=2, stroke_fill=(240, 240, 240))
@@ -271,7 +277,7 @@ def sheet_frames(window: Window, count: int = FRAMES) -> list[int]:
     Shorter windows repeat no frame; they give fewer.
     """
     frames = np.unique(np.linspace(window.start, window.stop, count).round().astype(int))
-    if window.landing is not None and len(frames) > 2:
+    if window.landing is not None and len(frames) > 2 and window.landing not in frames:
         nearest = int(np.abs(frames[1:-1] - window.landing).argmin()) + 1
         frames[nearest] = window.landing
     return sorted({int(f) for f in frames})
@@ -316,7 +322,7 @@ def render_sheet(
         marks = ground_marks(episode.scene)
         has_force = np.size(getattr(episode, "ground_force", ())) > 0
         panels = [
-            _panel(player, window, f, view, marks, touching(episode, f) if has_force else [])
+            _panel(player, window, f, view, marks, touching(episode, f) if has_force else None)
             for f, view in zip(frames, side_views(player, frames, *panel))
         ]
         rows = math.ceil(len(panels) / columns)
