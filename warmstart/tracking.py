@@ -13,27 +13,21 @@ Sampling, section 3; Williams 2017, Model Predictive Path Integral Control, for 
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
-import torch
 from mujoco.batch import Batch
 
-from sports import long_jump
-from sports.env import Starts, make_env, make_scene
-from sports.humanoid.body import Body, load_body
 from sports.humanoid.mjcf import build_spec
-from sports.physics.base import Geometry
 from sports.registry import task_names
-from sports.scene import Scene, humanoid_scene
+from sports.scene import Scene
 from warmstart.clip import Clip, clip_from_solution
+from warmstart.replay import play, scene_of, scene_options
 from warmstart.solution import Solution
+from warmstart.tracking_cost import JumpRules, Reference, Weights, jump_rules
 
 _VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 _State = tuple[np.ndarray, np.ndarray, np.ndarray]  # qpos, qvel, the solver's warm start
@@ -56,7 +50,7 @@ class Tracking:
     elites: int = 10
     """Candidates that are averaged, by rank."""
     seed: int = 0
-    weights: Weights = Weights()
+    weights: Weights = field(default_factory=Weights)
 
 
 @dataclass(frozen=True)

@@ -100,6 +100,7 @@ class JumpRules:
 
 
 def jump_rules(clip: Clip, scene: Scene, weights: Weights) -> JumpRules:
+    """The long jump's rules for a clip: its take-off event, and the length it was asked for."""
     events, asked = clip.meta.get("events", {}), clip.meta.get("asked", {})
     return JumpRules(
         takeoff=math.ceil(float(events.get("takeoff", 0.0)) / scene.control_timestep),

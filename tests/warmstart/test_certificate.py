@@ -18,10 +18,9 @@ from warmstart.certificate import (
     Check,
     certify,
     fine_times,
-    inverse_dynamics_drake,
-    inverse_dynamics_mujoco,
 )
 from warmstart.contact import sole_points
+from warmstart.inverse_dynamics import inverse_dynamics_drake, inverse_dynamics_mujoco
 from warmstart.outcome import cleared_height, jump_length, link_poses, lowest, support
 from warmstart.solution import Solution
 

@@ -10,7 +10,8 @@ from sports.humanoid.body import load_body
 from sports.humanoid.mjcf import build_model
 from sports.scene import humanoid_scene
 from warmstart.clip import Clip
-from warmstart.tracking import Tracking, play, scene_of, track
+from warmstart.replay import play, scene_of
+from warmstart.tracking import Tracking, track
 
 BODY = load_body("smpl", strength="human")
 LIGHT = Tracking(worlds=24, horizon=8, knot_every=2, iterations=2, noise=0.2)
