@@ -144,12 +144,11 @@ def run_render(config: Render) -> int:
     )
     written: list[Path] = []
     if config.sheet is not None:
-        episodes = {"best": played.best, "median": played.median}
+        episodes: dict[str, Any] = {"best": played.best, "median": played.median}
         written.append(render_sheet(episodes, config.sheet, commit=provenance.commit()))
     if config.out is not None:
-        written.append(
-            render_video(played.best, config.out, renderer=config.renderer, progress=True)
-        )
+        best: Any = played.best
+        written.append(render_video(best, config.out, renderer=config.renderer, progress=True))
     for path in written:
         print(f"wrote {path}")
     return 0

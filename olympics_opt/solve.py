@@ -184,9 +184,9 @@ def solution_plots(solution: Solution) -> Plots:
                 levels={"standing": 1.0},
             ),
             Plot(
-                "Largest torque, share of the limit",
+                "Largest torque",
                 "time (s)",
-                "1",
+                "share of the limit",
                 [
                     Series("legs", time, share[:, legs].max(axis=1)),
                     Series("trunk and arms", time, share[:, rest].max(axis=1)),

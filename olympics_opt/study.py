@@ -42,17 +42,31 @@ PLANS: dict[str, Plan] = {
 TRACKING_SEEDS = 3
 """Tries of the tracker before a motion counts as not trackable."""
 
+START_PROBABILITY = (0.5, 0.1)
+"""Share of training episodes that start from a state of the tracked motion: first, last."""
+FINE_TUNING: dict[str, Any] = {
+    "minibatches": 2,
+    "epochs": 3,
+    "sigma": 0.06,
+    "learning_rate": 2e-5,
+    "learning_rate_limits": (1e-6, 1e-4),
+    "critic_warmup": 20,
+}
+"""PPO for a few minutes from a policy that is good already: small steps, little noise, and a
+critic that first learns to judge it."""
+
 
 def run_study(config: Study) -> int:
     """The command. Raises ValueError for a sport without a plan, PolicyError for a policy that
     cannot be fine-tuned, Infeasible, and KeyboardInterrupt where it was asked to stop."""
-    from olympics_opt.play import athlete
+    from rl.policy import load_policy
 
     if config.name not in PLANS:
         raise ValueError(f"there is no study of '{config.name}'; there is: {', '.join(PLANS)}")
     plan = PLANS[config.name]
-    athlete(config.policy, config.name)  # an unusable policy is told before anything is solved
-    stages = make_stages(config, plan)
+    # An unusable policy is told before anything is solved.
+    digest = load_policy(config.policy, config.name).metadata["sha256"]
+    stages = make_stages(config, plan, digest)
     done = run_stages(config.out, stages)
     atomic.write_bytes(config.out / REPORT, (config.out / "report" / REPORT).read_bytes())
     total = sum(d.seconds for d in done.values())
@@ -62,7 +76,7 @@ def run_study(config: Study) -> int:
     return 0
 
 
-def make_stages(config: Study, plan: Plan) -> list[Stage]:
+def make_stages(config: Study, plan: Plan, policy_sha256: str) -> list[Stage]:
     """The stages of a study, wired to its folders."""
     out, task = config.out, config.name
     run = out / "train" / "run"
@@ -117,10 +131,12 @@ def make_stages(config: Study, plan: Plan) -> list[Stage]:
         }
 
     def train(folder: Path) -> dict[str, Any]:
+        from rl.ppo import PPOConfig
         from rl.train import TrainConfig, train
+        from warmstart.bank import demonstration_files
 
         demo = out / "warm_start" / DEMO
-        clips = (demo,) if demo.is_file() else ()
+        clips = (demo,) if demo.is_file() else tuple(demonstration_files(plan.problem))
         summary = train(
             TrainConfig(
                 task=task,
@@ -133,7 +149,8 @@ def make_stages(config: Study, plan: Plan) -> list[Stage]:
                 options=plan.options,
                 init=config.policy,
                 clips=clips,
-                start_probability=(0.5, 0.1),
+                start_probability=START_PROBABILITY,
+                ppo=PPOConfig(**FINE_TUNING),
             )
         )
         if summary.stopped_by == "signal":
@@ -142,7 +159,7 @@ def make_stages(config: Study, plan: Plan) -> list[Stage]:
             "samples": summary.samples,
             "minutes": summary.minutes,
             "iterations": summary.iterations,
-            "clips": len(clips),
+            "clips": [clip.stem for clip in clips],
         }
 
     def evaluate(folder: Path) -> dict[str, Any]:
@@ -200,8 +217,10 @@ def make_stages(config: Study, plan: Plan) -> list[Stage]:
                 **seed,
                 "minutes": config.minutes,
                 "worlds": config.worlds,
-                "policy": config.policy,
+                "policy_sha256": policy_sha256,
                 "options": plan.options,
+                "fine_tuning": FINE_TUNING,
+                "start_probability": START_PROBABILITY,
             },
             needs=("warm_start",),
             continues=True,
@@ -210,7 +229,7 @@ def make_stages(config: Study, plan: Plan) -> list[Stage]:
             "evaluate",
             "Playing the shipped and the fine-tuned policy",
             evaluate,
-            {**seed, "trials": config.trials, "policy": config.policy},
+            {**seed, "trials": config.trials, "policy_sha256": policy_sha256},
             needs=("train",),
         ),
         Stage(

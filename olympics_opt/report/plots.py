@@ -46,6 +46,8 @@ class Plot:
     """Vertical marks: text -> x."""
     levels: dict[str, float] = field(default_factory=dict)
     """Horizontal marks: text -> y."""
+    y_range: tuple[float, float] | None = None
+    """Fixed range of y (a rate: 0 to 1); None to fit the numbers."""
 
 
 def ticks(low: float, high: float, count: int = 5) -> list[float]:
@@ -69,7 +71,7 @@ def svg(plot: Plot) -> str:
     x0, x1 = _range(
         [v for s in drawn for v in (s.x.min(), s.x.max())] + list(plot.marks.values()), 0
     )
-    y0, y1 = _range(
+    y0, y1 = plot.y_range or _range(
         [v for s in drawn for v in (np.nanmin(_finite(s.y)), np.nanmax(_finite(s.y)))]
         + list(plot.levels.values()),
         0.06,
@@ -112,7 +114,10 @@ def svg(plot: Plot) -> str:
         parts.append(
             f'<line class="mark" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
         )
-        parts.append(f'<text class="tick" x="{LEFT + 4}" y="{y - 4:.1f}">{escape(text)}</text>')
+        parts.append(
+            f'<text class="tick" x="{WIDTH - RIGHT - 4}" y="{y - 4:.1f}" text-anchor="end">'
+            f"{escape(text)}</text>"
+        )
     for i, s in enumerate(drawn):
         parts.append(f'<path class="line s{i % COLOURS}" d="{_path(s, px, py)}"/>')
     parts.append(
@@ -168,7 +173,7 @@ def _finite(y: np.ndarray) -> np.ndarray:
 def _range(values: list[float], margin: float) -> tuple[float, float]:
     low, high = float(min(values)), float(max(values))
     if high - low < 1e-12 * max(1.0, abs(high)):
-        pad = 0.5 * max(1e-3, abs(high))
+        pad = 0.5 * abs(high) or 0.5
         return low - pad, high + pad
     pad = margin * (high - low)
     return low - pad, high + pad

@@ -36,7 +36,10 @@ def metric_text(metric: Mapping[str, Any] | None) -> str:
 
 def metric_table(results: Mapping[str, Mapping[str, Any]], caption: str = "") -> Table:
     """One column per named result, one row per metric; mean and 95 % interval."""
-    names = list(dict.fromkeys(m for r in results.values() for m in r["metrics"]))
+    defined = [
+        n for r in results.values() for n, m in r["metrics"].items() if m["mean"] is not None
+    ]
+    names = list(dict.fromkeys(defined))
     rows: list[list[object]] = [
         [_words(name), *(metric_text(r["metrics"].get(name)) for r in results.values())]
         for name in names
@@ -61,7 +64,7 @@ def asked_achieved_tiles(
 def certificate_section(certificate: Mapping[str, Any], title: str = "Certificate") -> Section:
     """Every check of a certificate with its figure and limit."""
     checks = certificate["checks"]
-    passed = bool(certificate["passed"])
+    passed = bool(certificate["passed"]) and all(c["passed"] for c in checks)
     verdict = Text(
         f"All {len(checks)} checks passed: this motion is a demonstration."
         if passed
@@ -133,7 +136,8 @@ def distribution_plots(samples: Mapping[str, Mapping[str, np.ndarray]], unit: Ma
             continue
         lines = [ecdf(ENGINE_NAMES.get(e, e), v) for e, v in values.items()]
         label = f"{_words(name)} ({unit[name]})" if unit.get(name) else _words(name)
-        plots.append(Plot(_words(name).capitalize(), label, "share of trials", lines))
+        title = _words(name).capitalize()
+        plots.append(Plot(title, label, "share of trials", lines, y_range=(0.0, 1.0)))
     return Plots(plots)
 
 
@@ -218,27 +222,25 @@ def learning_plots(rows: Sequence[Mapping[str, Any]], metrics: Sequence[str] = (
     def column(name: str) -> np.ndarray:
         return np.array([math.nan if r.get(name) is None else float(r[name]) for r in rows])
 
-    samples = column("samples") / 1e6
-    x_label = "samples (million)"
+    samples = column("samples")
+    scale, unit = (1e6, "million") if samples.max() >= 1e6 else (1e3, "thousand")
+    x, x_label = samples / scale, f"samples ({unit})"
+
+    def plot(title: str, y_label: str, names: Sequence[str], rate: bool = False) -> Plot:
+        lines = [Series(_words(n.partition("/")[2] or n), x, column(n)) for n in names]
+        return Plot(title, x_label, y_label, lines, y_range=(0.0, 1.0) if rate else None)
+
     found = [name for name in rows[-1] if name.startswith("metrics/")]
-    wanted = [f"metrics/{m}" for m in metrics] or found
-    plots = [
-        Plot("Return of an episode", x_label, "reward", [Series("r", samples, column("return"))]),
-        *(
-            Plot(
-                _words(name.partition("/")[2]).capitalize() + " while training",
-                x_label,
-                _words(name.partition("/")[2]),
-                [Series("m", samples, column(name))],
-            )
-            for name in wanted
-            if name in found
-        ),
-    ]
+    found = [n for n in found if not metrics or n.partition("/")[2] in metrics]
+    plots = [plot("Return of an episode", "reward", ["return"])]
+    for name in found:
+        words = _words(name.partition("/")[2])
+        plots.append(
+            plot(f"{words.capitalize()} while training", words, [name], "success" in words)
+        )
     curricula = [name for name in rows[-1] if name.startswith("curriculum/")]
-    if curricula:
-        lines = [Series(_words(n.partition("/")[2]), samples, column(n)) for n in curricula]
-        plots.append(Plot("Curriculum", x_label, "mean over worlds", lines))
+    if any(np.ptp(column(name)) > 0 for name in curricula):
+        plots.append(plot("Curriculum", "mean over worlds", curricula))
     return Plots(plots)
 
 
@@ -247,7 +249,7 @@ def provenance_section(facts: Mapping[str, Any]) -> Section:
     rows: list[list[object]] = []
     for name, value in facts.items():
         if isinstance(value, Mapping):
-            rows += [[f"{_words(name)}: {k}", _text(v)] for k, v in value.items()]
+            rows.extend([f"{_words(name)}: {k}", _text(v)] for k, v in value.items())
         else:
             rows.append([_words(name), _text(value)])
     return Section("Provenance", [Table(["", ""], rows)])

@@ -135,11 +135,11 @@ def _learning(task: str, training: dict[str, Any], rows: list[dict[str, Any]]) -
 
     main = get_task(task).main_metric
     wanted = list(dict.fromkeys(("success", main)))
-    clips = training["clips"]
+    clips = ", ".join(training["clips"])
     text = (
         f"{training['samples']:,} samples in {training['minutes']:.1f} minutes, "
-        f"{training['iterations']} iterations; "
-        + ("episodes start from the tracked motion in part. " if clips else "no demonstration. ")
+        f"{training['iterations']} iterations. "
+        + (f"Some episodes start from states of: {clips}. " if clips else "No demonstration. ")
         + "While training, actions carry noise and starts vary, so the rates here are lower than "
         "in the trials below."
     )

@@ -61,7 +61,9 @@ def test_options_of_a_task_reach_its_config():
     config = cli.parse("evaluate", cli.COMMANDS["evaluate"], args)
     assert config.name == "high_jump"
     assert cli.chosen_options(config, "task") == {"bar_height": 1.2, "curriculum": False}
-    plain = cli.parse("evaluate", cli.COMMANDS["evaluate"], ["long_jump", "--policy", "x", "--out", "y"])
+    plain = cli.parse(
+        "evaluate", cli.COMMANDS["evaluate"], ["long_jump", "--policy", "x", "--out", "y"]
+    )
     assert cli.chosen_options(plain, "task") == {}
 
 
@@ -131,3 +133,44 @@ def test_list_as_json(capsys):
     assert {p["name"] for p in found["problems"]} == {"high_jump", "long_jump"}
     for policy in found["pretrained"]:
         assert Path(policy["path"]).is_file()
+
+
+SCHEMA = {
+    *("task", "algo", "policy_sha256", "engine", "strength", "limits", "trials", "seed"),
+    *("commit", "versions", "hardware", "metrics", "overflow", "nan_worlds"),
+}
+"""Fields that every result file must have."""
+
+
+def test_evaluate_writes_the_schema_and_repeats_itself(tmp_path: Path):
+    results = []
+    for name in ("a.json", "b.json"):
+        out = tmp_path / name
+        line = f"evaluate long_jump --policy random --trials 3 --seed 5 --out {out}"
+        assert cli.main(line.split()) == 0
+        results.append(json.loads(out.read_text()))
+    assert results[0].keys() >= SCHEMA
+    assert results[0] == results[1]
+    success = results[0]["metrics"]["success"]
+    assert success.keys() == {"mean", "ci95", "n", "unit"} and success["n"] == 3
+
+
+def test_evaluate_survives_no_place_to_write(tmp_path: Path, capsys):
+    (tmp_path / "file").write_text("in the way")
+    out = tmp_path / "file" / "result.json"
+    line = f"evaluate high_jump --policy zero --trials 1 --out {out}"
+    assert "file" in sentence_of(capsys, *line.split())
+
+
+def test_render_wants_something_to_write(capsys):
+    assert "--sheet" in sentence_of(capsys, "render", "high_jump", "--policy", "zero")
+    line = "render high_jump --policy zero --out picture.gif"
+    assert ".mp4" in sentence_of(capsys, *line.split())
+
+
+def test_sweep_values():
+    from olympics_opt.solve import sweep_values
+
+    assert sweep_values("bar-height=0.8:1.4:3") == ("bar_height", [0.8, 1.1, 1.4])
+    with pytest.raises(ValueError, match="FIRST:LAST:COUNT"):
+        sweep_values("bar-height=0.8")

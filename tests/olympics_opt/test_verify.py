@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from olympics_opt.verify import compare_metric, judge, success_difference
+from olympics_opt import cli
+from olympics_opt.verify import compare, compare_metric, judge, success_difference
 
 
 def sample(hits: int, trials: int) -> np.ndarray:
@@ -88,3 +91,47 @@ def test_verdicts():
     assert not run(0.0, 0.0, 0.0).passed
     assert not run(1.0, 1.0, 1.0, bad=1).passed
     assert not run(1.0, 1.0, 1.0, parity=False).passed
+
+
+def test_a_comparison_of_equal_samples_finds_nothing():
+    rng = np.random.default_rng(0)
+    sample_ = {"success": (rng.random(50) < 0.9).astype(float), "height": rng.normal(size=50)}
+    runs = ("mujoco", "mujoco-half-step", "drake")
+    found = compare(
+        {r: {"overflow": 0, "nan_worlds": 0} for r in runs}, dict.fromkeys(runs, sample_)
+    )
+    assert found["verdict"]["passed"] and found["verdict"]["kept"] == 1.0
+    for run_ in runs[1:]:
+        assert found["success"][run_]["low"] < 0 < found["success"][run_]["high"]
+        (height,) = found["comparisons"][run_]
+        assert height["ks"] == 0.0 and height["permutation_p"] > 0.9
+
+
+def test_standing_still_verifies_nothing_and_still_gets_its_report(tmp_path: Path, capsys):
+    """The whole command on a policy that only stands: parity first, then scores, then exit 1."""
+    line = ["verify", "high_jump", "--policy", "zero", "--trials", "2", "--processes", "1"]
+    assert cli.main([*line, "--out", str(tmp_path)]) == 1
+    out = capsys.readouterr().out
+    assert out.index("mass matrix") < out.index("trials")
+    assert "never succeeds in MuJoCo" in out
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert not report["verdict"]["passed"]
+    assert all(row["ok"] for row in report["parity"])
+    assert set(report["results"]) == {"mujoco", "mujoco-half-step", "drake"}
+    half, whole = (report["results"][r]["timestep"] for r in ("mujoco-half-step", "mujoco"))
+    assert half == pytest.approx(whole / 2)
+    page = (tmp_path / "report.html").read_text()
+    assert "Parity of the models" in page and "replay-verify" in page
+
+
+def test_models_that_differ_are_not_scored(tmp_path: Path, monkeypatch, capsys):
+    def different(task, strength, limits):
+        row = {"quantity": "mass", "mujoco": 1.0, "drake": 2.0, "difference": 1.0}
+        return [{**row, "unit": "kg", "tolerance": 1e-9, "ok": False}]
+
+    monkeypatch.setattr("olympics_opt.verify.parity_rows", different)
+    line = ["verify", "high_jump", "--policy", "zero", "--trials", "2", "--out", str(tmp_path)]
+    assert cli.main(line) == 1
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["results"] == {} and "differ" in report["verdict"]["reasons"][0]
+    assert "must not be compared" in (tmp_path / "report.html").read_text()
