@@ -19,10 +19,14 @@ from warmstart.certificate import (
     certify,
     fine_times,
 )
+from warmstart.clip import Clip
 from warmstart.contact import sole_points
+from warmstart.demonstration import demonstrate, save_demonstration
 from warmstart.inverse_dynamics import inverse_dynamics_drake, inverse_dynamics_mujoco
 from warmstart.outcome import cleared_height, jump_length, link_poses, lowest, support
+from warmstart.replay import play
 from warmstart.solution import Solution
+from warmstart.tracking import Tracking
 
 BODY = load_body("smpl", strength="human")
 N = BODY.num_dofs
@@ -324,3 +328,25 @@ def test_kinematics_are_mujocos():
     mujoco.mj_forward(model, data)
     deepest = min(contact.dist for contact in data.contact if 0 in contact.geom)
     assert lowest(BODY, sunk)[0] == pytest.approx(deepest, abs=1e-6)
+
+
+QUICK = Tracking(worlds=4, horizon=4, iterations=1)
+
+
+def test_a_certified_motion_that_succeeds_in_its_task_is_a_demonstration(tmp_path):
+    """Thrown over the bar, the athlete lands beyond it, and the task says that the bar stayed."""
+    found = demonstrate(thrown(), QUICK)
+    assert found.passed and found.clip is not None and found.reason == ""
+    assert found.clip.meta["achieved"]["bar_height"] == 1.0
+    assert found.clip.duration > 0.5  # past the plan's end, until the task had decided
+    save_demonstration(found, tmp_path / "demo.npz", tmp_path / "certificate.json")
+    assert Certificate.from_json(tmp_path / "certificate.json").passed
+    clip = Clip.load(tmp_path / "demo.npz")
+    again, metrics = play(clip, "high_jump", {"bar_height": 1.0}, BODY)
+    assert metrics["success"] == 1.0 and again.num_frames == clip.num_frames
+
+
+def test_what_the_gate_refuses_is_not_tracked():
+    found = demonstrate(thrown(asked={"bar_height": 1.6}), QUICK)
+    assert not found.passed and found.clip is None
+    assert "clearance over the bar" in found.reason
