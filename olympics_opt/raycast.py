@@ -172,7 +172,7 @@ def _inside(mark: Mark, points: np.ndarray) -> np.ndarray:
     edges = np.roll(corners, -1, axis=0) - corners
     rel = points[..., None, :] - corners
     cross = edges[:, 0] * rel[..., 1] - edges[:, 1] * rel[..., 0]
-    return (cross >= 0).all(-1) | (cross <= 0).all(-1)
+    return np.logical_or((cross >= 0).all(-1), (cross <= 0).all(-1))
 
 
 def _lines(x: np.ndarray, width: float) -> np.ndarray:

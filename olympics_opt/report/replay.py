@@ -1,7 +1,8 @@
 """A 3-D replay inside a page: motions, scene and player in one piece of HTML.
 
 The fragment needs no library, no WebGL and no network: the states are packed as 16-bit numbers,
-the page computes the link poses (``replay_scene.js``) and draws them on a canvas (``replay.js``).
+the page computes the link poses (``replay_scene.js``), draws them on a canvas
+(``replay_draw.js``) and has a player's controls (``replay.js``).
 """
 
 from __future__ import annotations
@@ -297,7 +298,7 @@ def replay_html(
         raise ValueError(f"element id '{element_id}' may hold letters, digits, - and _ only")
     data = replay_data(scene, tracks, poster=poster, autoplay=autoplay)
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    script = _text("replay_scene.js") + _text("replay.js")
+    script = "".join(map(_text, ("replay_scene.js", "replay_draw.js", "replay.js")))
     return (
         f'<div class="replay" id="{element_id}" tabindex="0" role="group" '
         f'aria-label="3-D replay: {escape(title)}">\n'

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from olympics_opt import episode as episode_of
 from olympics_opt import render
 from olympics_opt.raycast import Solid, View, draw, intersect
 from olympics_opt.scenery import Mark, link_color, rgb
@@ -90,7 +91,7 @@ def test_decisive_window_finds_the_flight_over_the_mark() -> None:
         # A hop before and a stumble after the jump must not be taken for it.
         episode.ground_force[5:8] = 0.0
         episode.ground_force[90:93] = 0.0
-        window = render.decisive_window(episode, render.Player(episode))
+        window = episode_of.decisive_window(episode, episode_of.Player(episode))
         assert window.takeoff == takeoff + 1
         assert window.landing is not None
         airtime = (window.landing - window.takeoff) / 30
@@ -103,16 +104,16 @@ def test_decisive_window_finds_the_flight_over_the_mark() -> None:
 def test_flight_from_shapes_agrees_with_flight_from_forces() -> None:
     episode = jump(bar_scene(), "long_jump")
     episode.qpos[:, 7:76] = 0.0
-    player = render.Player(episode)
-    by_force = render.airborne(episode, player)
+    player = episode_of.Player(episode)
+    by_force = episode_of.airborne(episode, player)
     episode.ground_force = np.zeros(0)
-    by_shape = render.airborne(episode, player)
+    by_shape = episode_of.airborne(episode, player)
     assert (by_force != by_shape).sum() <= 1
 
 
 def test_an_episode_without_a_jump_is_shown_by_its_end() -> None:
     episode = jump(bar_scene(), "long_jump", takeoff=140, frames=140)
-    window = render.decisive_window(episode, render.Player(episode))
+    window = episode_of.decisive_window(episode, episode_of.Player(episode))
     assert window.takeoff is None and window.stop == 139 and window.start == 49
 
 
@@ -121,7 +122,7 @@ def test_lowest_point_matches_the_standing_height() -> None:
     episode = jump(bar_scene(), "high_jump")
     episode.scene, episode.qpos = scene, scene.default_qpos()[None]
     episode.mocap_pos = np.zeros((1, 0, 3))
-    assert render.Player(episode).lowest(0) == pytest.approx(0.005, abs=1e-6)
+    assert episode_of.Player(episode).lowest(0) == pytest.approx(0.005, abs=1e-6)
 
 
 def test_sheet_has_twelve_panels_for_each_recording(tmp_path: Path) -> None:

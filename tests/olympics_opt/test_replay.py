@@ -194,7 +194,19 @@ def test_headless_browser_draws_the_athlete(tmp_path: Path) -> None:
         scene, [ReplayTrack.from_episode(jump(scene, "high_jump"), "a")], title="jump"
     ).replace('"autoplay":true', '"autoplay":false')
     errors = "<script>addEventListener('error', e => { document.title = e.message; });</script>"
-    done = "<script>if (document.title === 'jump') document.title = 'drawn';</script></body>"
+    done = """<script>
+    const root = document.getElementById('replay'), player = root.replay, seen = [];
+    const press = key => root.dispatchEvent(new KeyboardEvent('keydown', {key, bubbles: true}));
+    const look = () => {
+      player.draw();
+      seen.push(Number(root.querySelector('[data-replay=scrub]').value).toFixed(3));
+    };
+    for (const key of ['Home', 'ArrowRight', 'ArrowRight', 'ArrowLeft', 'End']) press(key), look();
+    player.seek(1.2);
+    press('f');
+    seen.push(player.state.view.follow);
+    if (document.title === 'jump') document.title = seen.join(' ');
+    </script></body>"""
     page = page.replace("<head>", "<head>" + errors).replace("</body>", done)
     (tmp_path / "page.html").write_text(page)
     common = [
@@ -215,5 +227,5 @@ def test_headless_browser_draws_the_athlete(tmp_path: Path) -> None:
     text = subprocess.run(
         [*common, "--dump-dom", target], capture_output=True, text=True, timeout=120, check=True
     ).stdout
-    assert "<title>drawn</title>" in text
+    assert "<title>0.000 0.033 0.067 0.033 2.467 false</title>" in text
     assert re.search(r"height \d\.\d\d m", text)
