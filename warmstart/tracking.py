@@ -35,7 +35,7 @@ _State = tuple[np.ndarray, np.ndarray, np.ndarray]  # qpos, qvel, the solver's w
 
 @dataclass(frozen=True)
 class Tracking:
-    """Settings of the sampling."""
+    """Settings of the sampling. Raises ValueError when nothing could be sampled with them."""
 
     worlds: int = 96
     """Candidates simulated at once."""
@@ -51,6 +51,12 @@ class Tracking:
     """Candidates that are averaged, by rank."""
     seed: int = 0
     weights: Weights = field(default_factory=Weights)
+
+    def __post_init__(self) -> None:
+        if self.worlds < 2 or min(self.horizon, self.knot_every, self.elites) < 1:
+            raise ValueError(
+                "tracking needs at least 2 worlds, and horizon, knot_every and elites of at least 1"
+            )
 
 
 @dataclass(frozen=True)
@@ -262,7 +268,6 @@ def _follow(
 
     for now in range(steps):
         ahead = np.arange(now, min(now + settings.horizon, steps))
-
         state = (state_q, state_v, warm)
         known = [plan, np.zeros_like(plan)]
         for round_ in range(settings.iterations):
