@@ -44,11 +44,12 @@ class Phase:
     feet: Mapping[str, str] = field(default_factory=dict)
     """Contact mode by side, e.g. ``{"L": "flat"}``; modes: ``flat``, ``toe``."""
     grading: float = 1.0
-    """Length of the last interval over the first: small steps where motion is abrupt."""
+    """Length of the later intervals over the first: small steps where motion is abrupt."""
 
     def spacing(self) -> np.ndarray:
-        """(intervals,) lengths relative to their mean, growing geometrically."""
-        w = np.geomspace(1.0, self.grading, self.intervals)
+        """(intervals,) lengths relative to their mean: growing over the first third, then equal."""
+        i = np.arange(self.intervals) / max(self.intervals / 3, 1)
+        w = np.minimum(1 / self.grading + (1 - 1 / self.grading) * i, 1.0)
         return w / w.mean()
 
 
@@ -92,12 +93,13 @@ class Transcription:
         bounds: Bounds,
         weights: Weights | None = None,
         held_limits: Sequence[str] = (),
+        flight_limits: Sequence[str] = (),
         parameters: int = 0,
         elastic: bool = False,
     ) -> None:
         self.body, self.model, self.phases = body, model, tuple(phases)
         self.bounds, self.weights = bounds, weights or Weights()
-        self.held_limits = tuple(held_limits)
+        self.held_limits, self.flight_limits = tuple(held_limits), tuple(flight_limits)
         self.program = Program(parameters)
         self.elastic = elastic
         self.ends = np.cumsum([0, *(p.intervals for p in phases)])
@@ -237,13 +239,12 @@ class Transcription:
 
     # -- rows --------------------------------------------------------------------------------
     def _add_dynamics(self) -> None:
-        """Root wrench zero, joint torque = u - kd v, friction cones; limits of held joints in
-        stance, where they matter."""
+        """Root wrench zero, joint torque = u - kd v, friction cones; limits of held joints
+        where they matter (more of them in stance than in flight)."""
         model = self.model
         tree = model.tree
         damping = ca.DM(tree.damping[model.free_index])
         effort = ca.DM(self.effort)
-        held = [tree.dofs.index(d) for d in self.held_limits if d not in model.free]
         groups: dict[tuple[str, ...], list[int]] = {}
         for k in range(self.K):
             key = tuple(side for side in self.sides if k in self.f[side])
@@ -251,7 +252,10 @@ class Transcription:
         for sides, knots in groups.items():
             points = [point for side in sides for point in sole_points(self.body, side)]
 
-            def build(q, v, a, u, *rest, points=points):
+            limited = self.held_limits if points else self.flight_limits
+            held = [tree.dofs.index(d) for d in limited if d not in model.free]
+
+            def build(q, v, a, u, *rest, points=points, held=held):
                 forces, rows = [], []
                 if points:
                     f = ca.reshape(rest[0], 3, len(points))
@@ -267,7 +271,7 @@ class Transcription:
                     ("base moment", tau[3:6] / (0.5 * self.weight), 0.0, 0.0),
                     ("torque", (joint + damping * v[6:] - u) / effort, 0.0, 0.0),
                 ]
-                if held and points:
+                if held:
                     limit = ca.DM(tree.effort[held] * self.bounds.torque_share)
                     rows.append(("held torque", tau[[6 + i for i in held]] / limit, -1.0, 1.0))
                 return 0.0, rows

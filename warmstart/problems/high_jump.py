@@ -79,6 +79,7 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
         "x": (BAR_X - 5, BAR_X + 3),
         "y": (LANE_Y - 0.5, LANE_Y + 0.5),
         "z": (0.5, 3.0),
+        "roll": (-0.35, 0.35),
     }
     program = Transcription(
         body,
@@ -86,6 +87,7 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
         phases,
         Bounds(position, jumper.boxes(jumper.RATE)),
         held_limits=jumper.HELD_LIMITS,
+        flight_limits=jumper.FLIGHT_LIMITS,
         parameters=1,
         elastic=elastic,
     )

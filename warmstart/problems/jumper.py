@@ -21,6 +21,7 @@ FREE = (
     *(f"{side}_{joint}" for side in "LR" for joint in LEGS),
     "Torso_x",
     "Torso_y",
+    "Torso_z",
     "Chest_y",
     "L_Shoulder_z",
     "R_Shoulder_z",
@@ -31,22 +32,25 @@ HELD_LIMITS = (
     *(f"{side}_Knee_{axis}" for side in "LR" for axis in "xz"),
     *(f"{side}_Thorax_{axis}" for side in "LR" for axis in "xyz"),
     *(f"{side}_{dof}" for side in "LR" for dof in ("Ankle_z", "Toe_x", "Toe_z")),
-    *("Torso_z", "Spine_x", "Spine_y", "Spine_z", "Chest_x", "Chest_z"),
+    *("Spine_x", "Spine_y", "Spine_z", "Chest_x", "Chest_z"),
     *("Neck_y", "Head_y"),
 )
-"""Held joints whose holding torque comes near its limit and is therefore bounded too."""
+"""Held joints whose holding torque comes near its limit in stance and is therefore bounded."""
+FLIGHT_LIMITS = ("L_Knee_x", "R_Knee_x", "L_Thorax_y", "R_Thorax_y", "Spine_x", "Neck_y")
+"""The same in flight."""
 POSITION = {
     "pitch": (-0.7, 1.9),
-    "roll": (-0.35, 0.35),
-    "yaw": (-0.4, 0.4),
-    "Hip_x": (-0.3, 0.3),
+    "roll": (-0.5, 0.5),
+    "yaw": (-0.8, 0.8),
+    "Hip_x": (-0.5, 0.5),
     "Hip_y": (-2.1, 0.6),
-    "Hip_z": (-0.3, 0.3),
+    "Hip_z": (-0.6, 0.6),
     "Knee_y": (0.05, 2.3),
     "Ankle_x": (-0.3, 0.3),
     "Ankle_y": (-0.6, 0.8),
     "Toe_y": (-0.9, 0.2),
-    "Torso_x": (-0.3, 0.3),
+    "Torso_x": (-0.4, 0.4),
+    "Torso_z": (-0.5, 0.5),
     "Torso_y": (-0.2, 0.5),
     "Chest_y": (-0.2, 0.4),
     "L_Shoulder_z": (-2.2, 0.9),
@@ -67,7 +71,7 @@ RATE = {
 
 
 def make_model(body: Body) -> ReducedModel:
-    """The athlete of both jumps: 6 + 19 coordinates."""
+    """The athlete of both jumps: 6 + 20 coordinates."""
     return reduce_tree(load_tree(body), FREE, POSE)
 
 
@@ -123,7 +127,7 @@ def start_rows(
     for name, (low, high) in limits.items():
         program.bound(program.q[0, model.index(name)], low, high)
     for name in ("pitch", "roll", "yaw"):
-        program.bound(program.v[0, model.index(name)], -1.5, 1.5)
+        program.bound(program.v[0, model.index(name)], -2.5, 2.5)
 
 
 def legs(left: Sequence[float], right: Sequence[float], **more: float) -> dict[str, float]:
@@ -150,6 +154,46 @@ def key_frames(
         for name, value in frame.items():
             row[model.index(name)] = value
     return PchipInterpolator(times, poses, axis=0)(np.clip(at, times[0], times[-1]))
+
+
+def plant_foot(model: ReducedModel, q: np.ndarray, flat: np.ndarray, push: np.ndarray) -> None:
+    """Bends the left leg of a guess (K, n) so that its foot stays where it stands.
+
+    Planar two-link inverse kinematics about the hip. ``flat`` and ``push``: knots with the sole
+    on the ground and with the heel rising to 0.8 rad. The ankle is placed under the middle of
+    the root's path, so that the leg reaches forward first and back last.
+    """
+    tree = model.tree
+    thigh = -tree.offset[tree.link("L_Knee")][[0, 2]]
+    shin = -tree.offset[tree.link("L_Ankle")][[0, 2]]
+    hip = tree.offset[tree.link("L_Hip")]
+    heel, sole = 0.07, tree.offset[tree.link("L_Toe")]
+    a, b = np.hypot(*thigh), np.hypot(*shin)
+    knots = np.concatenate([flat, push])
+    anchor = 0.5 * (q[knots[0], 0] + q[knots[-1], 0]) - 0.03
+    for k in knots:
+        lift = 0.8 * np.clip((k - push[0]) / max(len(push) - 1, 1), 0.0, 1.0) if k in push else 0.0
+        toe = np.array([anchor + sole[0], heel + sole[2]])
+        ankle = toe - [
+            sole[0] * np.cos(lift) + sole[2] * np.sin(lift),
+            sole[2] * np.cos(lift) - sole[0] * np.sin(lift),
+        ]
+        pitch = q[k, 3]
+        root = q[k, [0, 2]] + [
+            hip[0] * np.cos(pitch) + hip[2] * np.sin(pitch),
+            hip[2] * np.cos(pitch) - hip[0] * np.sin(pitch),
+        ]
+        d = ankle - root
+        reach = min(np.hypot(*d), 0.995 * (a + b))
+        bend = np.pi - np.arccos((a * a + b * b - reach * reach) / (2 * a * b))
+        lean = np.arccos((a * a + reach * reach - b * b) / (2 * a * reach))
+        thigh_angle = -np.arctan2(d[0], -d[1]) - lean
+        shape = np.arctan2(thigh[0], thigh[1]), np.arctan2(shin[0], shin[1])
+        hip_y = thigh_angle - pitch - shape[0]
+        knee = bend + shape[0] - shape[1]
+        angles = hip_y, knee, lift - (pitch + hip_y + knee), -lift
+        for joint, angle in zip(("Hip_y", "Knee_y", "Ankle_y", "Toe_y"), angles, strict=True):
+            q[k, model.index(f"L_{joint}")] = angle
 
 
 class _Progress(ca.Callback):

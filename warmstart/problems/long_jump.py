@@ -59,14 +59,14 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     body = load_body("smpl", strength=config.strength)
     model = jumper.make_model(body)
     phases = [
-        Phase("flat", 14, (0.06, 0.25), {"L": "flat"}),
-        Phase("toe", 8, (0.03, 0.12), {"L": "toe"}),
-        Phase("flight", 52, (0.25, 1.20), grading=2.0),
+        Phase("flat", 16, (0.075, 0.25), {"L": "flat"}, grading=2.0),
+        Phase("toe", 9, (0.045, 0.12), {"L": "toe"}),
+        Phase("flight", 48, (0.25, 1.20), grading=4.0),
     ]
     position = jumper.boxes(jumper.POSITION) | {
         "x": (LINE_X - 3, LINE_X + 12),
         "y": (-0.5, 0.5),
-        "z": (0.5, 2.5),
+        "z": (0.42, 2.5),
         "pitch": (-0.7, 1.2),
     }
     program = Transcription(
@@ -75,6 +75,7 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
         phases,
         Bounds(position, jumper.boxes(jumper.RATE)),
         held_limits=jumper.HELD_LIMITS,
+        flight_limits=jumper.FLIGHT_LIMITS,
         parameters=1,
         elastic=elastic,
     )
@@ -118,17 +119,19 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
             ("toes beyond the length", ca.vertcat(*[s[0] for s in soles]), 0.0, np.inf),
             ("body behind the feet", LINE_X + p[0] - com[0], -0.2, 0.75),
             ("carried forward", velocity[0], 1.5, np.inf),
-            ("trunk over the legs", com[2], 0.60, 1.3),
+            ("trunk over the legs", com[2], 0.50, 1.3),
         ]
 
     program.rows("landing", [program.K - 1], land, rates=True)
+    for name in ("roll", "yaw"):
+        program.bound(program.q[-1, model.index(name)], -0.4, 0.4)
     return program
 
 
 def first_guess(program: Transcription, length: float) -> np.ndarray:
     """Key poses of a sail-style jump along a ballistic root path."""
-    off, air = 0.16, 0.33 + 0.06 * length
-    durations = (0.10, off - 0.10, air)
+    off, air = 0.125, 0.40 + 0.05 * length
+    durations = (0.07, off - 0.07, air)
     t = program.nominal_times(durations)
     arms = [{"L_Shoulder_z": -s, "R_Shoulder_z": s} for s in (-0.4, 0.0, 0.6, 1.5, 1.0, 0.6)]
     frames = [
@@ -139,16 +142,17 @@ def first_guess(program: Transcription, length: float) -> np.ndarray:
         jumper.legs((-1.2, 0.8, 0, 0), (-1.2, 0.8, 0, 0), pitch=0.2, Torso_y=0.3, **arms[4]),
         jumper.legs((-1.4, 0.6, 0, 0), (-1.4, 0.6, 0, 0), pitch=0.3, Torso_y=0.4, **arms[5]),
     ]
-    times = [0, 0.10, off, off + 0.35 * air, off + 0.75 * air, off + air]
+    times = [0, 0.6 * off, off, off + 0.35 * air, off + 0.75 * air, off + air]
     q = jumper.key_frames(program.model, times, frames, t)
-    start, land, take_off = 0.95, 0.70, 1.02
-    speed = (length - 0.5 + 0.05) / air
+    start, land, take_off = 0.82, 0.62, 0.93
+    speed = (length - 0.75 - 0.15) / air
     rise = (land - take_off + 4.905 * air**2) / air
     fly = np.clip(t - off, 0.0, None)
-    q[:, 0] = LINE_X - 0.05 + speed * (t - off)
+    q[:, 0] = LINE_X + 0.15 + speed * (t - off)
     q[:, 2] = np.where(
         t < off, start + (take_off - start) * (t / off) ** 2, take_off + rise * fly - 4.905 * fly**2
     )
+    jumper.plant_foot(program.model, q, program.knots("flat"), program.knots("toe")[1:])
     return program.guess(q, durations)
 
 
