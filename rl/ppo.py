@@ -46,14 +46,14 @@ class PPOConfig:
     """Standard deviation of the policy in action units (1 = the bound)."""
     sigma_final: float | None = None
     """Standard deviation at the end of the run, reached geometrically; None keeps ``sigma``."""
-    learning_rate: float = 3e-4
+    learning_rate: float = 1e-4
     """First learning rate of the actor."""
     critic_learning_rate: float = 5e-4
     """Learning rate of the critic, constant."""
     kl_band: tuple[float, float] | None = (0.008, 0.03)
     """The actor's rate falls where the KL divergence of a minibatch (nats, summed over the action)
     is above the band and rises where it is below; None keeps it constant."""
-    learning_rate_limits: tuple[float, float] = (3e-5, 1e-3)
+    learning_rate_limits: tuple[float, float] = (1e-5, 1e-3)
     """The KL control stays between these."""
     learning_rate_factor: float = 1.5
     """One step of the KL control."""
@@ -81,14 +81,8 @@ class PPOConfig:
             raise ValueError("steps, minibatches and epochs must be at least 1")
 
 
-STATISTICS = (
-    "kl",
-    "clip_fraction",
-    "policy_loss",
-    "value_loss",
-    "bounds_loss",
-    "explained_variance",
-)
+STATISTICS = ("kl", "clip_fraction", "policy_loss", "value_loss", "bounds_loss")
+STATISTICS += ("explained_variance",)
 """What ``PPO.update`` reports."""
 
 PAPER = replace(
@@ -148,6 +142,7 @@ class PPO:
         device: torch.device | str = "cpu",
         seed: int = 0,
         cuda_graph: bool = True,
+        bf16: bool | None = None,
     ) -> None:
         """Args:
         obs_size: features D of an observation.
@@ -156,6 +151,7 @@ class PPO:
         device: where networks and rollouts live.
         seed: of the first weights (equal on all ranks) and of the noise (mixed with the rank).
         cuda_graph: replay the minibatch step as a graph where that is possible.
+        bf16: multiply in bf16; None for on a GPU only.
         """
         self.config, self.device = config, torch.device(device)
         weights = torch.Generator().manual_seed(seed)
@@ -177,18 +173,14 @@ class PPO:
         self.actor_weight = scalar(1.0)
         """0 while only the critic learns."""
         cuda = self.device.type == "cuda"
-        self.obs_dtype = torch.bfloat16 if cuda else torch.float32
-        self.optimizer = torch.optim.Adam(
-            [
-                {"params": list(self.actor.parameters()), "lr": self.learning_rate},
-                {
-                    "params": list(self.critic.parameters()),
-                    "lr": scalar(config.critic_learning_rate),
-                },
-            ],
-            fused=True,
-            capturable=cuda,
-        )
+        self.bf16 = cuda if bf16 is None else bf16
+        self.obs_dtype = torch.bfloat16 if cuda and self.bf16 else torch.float32
+        critic_rate = scalar(config.critic_learning_rate)
+        groups = [
+            {"params": list(self.actor.parameters()), "lr": self.learning_rate},
+            {"params": list(self.critic.parameters()), "lr": critic_rate},
+        ]
+        self.optimizer = torch.optim.Adam(groups, fused=True, capturable=cuda)
         self._stats = torch.zeros(5, device=self.device)
         self._batch: dict[str, Tensor] = {}
         wanted = cuda_graph and cuda and self.world_size == 1
@@ -213,7 +205,7 @@ class PPO:
         return torch.autocast(
             self.device.type,
             dtype=torch.bfloat16,
-            enabled=self.device.type == "cuda",
+            enabled=self.bf16,
             cache_enabled=False,
         )
 
@@ -262,22 +254,12 @@ class PPO:
         means = self._stats / (c.epochs * c.minibatches)
         return dict(zip(STATISTICS, (*means.unbind(), 1.0 - unexplained)))
 
-    def observe_only(self) -> None:
-        """Ends an iteration that only gathered observation statistics."""
-        self.obs_norm.commit()
-
     def _compute_advantages(self, r: Rollout) -> Tensor:
         """Fills advantages and returns of the rollout; returns its values (T, M)."""
         value, next_value = self.value(r.obs), self.value(r.final_obs)
+        c, ends = self.config, (r.terminated, r.truncated, r.valid)
         advantages, returns = generalized_advantages(
-            r.reward,
-            value,
-            next_value,
-            r.terminated,
-            r.truncated,
-            r.valid,
-            self.config.gamma,
-            self.config.lam,
+            r.reward, value, next_value, *ends, c.gamma, c.lam
         )
         r.advantages.copy_(advantages)
         r.returns.copy_(returns)
