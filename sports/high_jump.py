@@ -6,7 +6,9 @@ SMPLOlympics section 4 for the goal and reward; World Athletics technical rules 
 (2.0 kg; a trial fails when the bar does not stay on).
 
 The height term pays for *new* ground gained over the bar, so that standing there earns nothing;
-at 3 m/s it equals the paper's.
+at 3 m/s it equals the paper's. Beyond the paper's terms a jump that counts earns ``CLEARED`` once:
+without it nothing is paid for leaving the bar on, and PPO (93 M samples) somersaulted 5 m over a
+1.5 m bar and out of the field in 94 % of its trials, or at human strength ran through the bar.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from torch import Tensor
 from sports.humanoid.body import Body, Shape
 from sports.physics.base import PhysicsState
 from sports.scene import Scene, SceneObject
-from sports.task import Advance, Memory, Task, View, clamp01, nan_where, progress
+from sports.task import Advance, Memory, Task, View, clamp01, constant, nan_where, progress
 
 BAR_X, BAR_Y = 20.0, 6.0
 HALF_GAP = 2.0
@@ -32,6 +34,8 @@ EVALUATION_HEIGHTS = (1.0, 1.5)
 HOLD_STEPS = 15
 """Steps the bar must stay on after the first ground contact beyond it."""
 STALL_STEPS, STALL_SPEED = 15, 0.1
+CLEARED = 10.0
+"""Reward of a jump that counts, once: about the height term of an ordinary one."""
 MAX_DROP, MAX_SHIFT, MAX_PUSH = 0.05, 0.10, 50.0
 
 # Each upright holds the bar in a shallow groove of two balls; about 9 N sideways lifts it out.
@@ -101,7 +105,7 @@ def curriculum(config: HighJump, num_worlds: int, device: torch.device) -> Memor
 def promote(view: View, memory: Memory, step: Advance, ended: Tensor) -> Memory:
     """One level up for a world that cleared the bar of its level."""
     level = view.curriculum["level"]
-    heights = torch.tensor(HEIGHTS, device=level.device)
+    heights = constant(HEIGHTS, level.device)
     at_level = memory["bar_height"] >= heights[level] - 1e-4
     up = ended & step.success & at_level
     return {"level": (level + up.long()).clamp(max=len(HEIGHTS) - 1)}
@@ -114,14 +118,14 @@ def _heights(view: View, n: int, generator: torch.Generator, training: bool) -> 
         return torch.full((n,), config.bar_height, device=device)
     if not training:
         turn = torch.arange(n, device=device) % len(EVALUATION_HEIGHTS)
-        return torch.tensor(EVALUATION_HEIGHTS, device=device)[turn]
+        return constant(EVALUATION_HEIGHTS, device)[turn]
     if not config.curriculum:
         return torch.full((n,), HEIGHTS[2], device=device)
     # Half of the episodes at the world's own level, half at any it has reached: none forgotten.
     level = view.curriculum["level"]
     draw = torch.rand(n, 2, device=device, generator=generator)
     lower = (draw[:, 1] * (level + 1)).long().clamp(max=len(HEIGHTS) - 1)
-    return torch.tensor(HEIGHTS, device=device)[torch.where(draw[:, 0] < 0.5, level, lower)]
+    return constant(HEIGHTS, device)[torch.where(draw[:, 0] < 0.5, level, lower)]
 
 
 def start(
@@ -218,6 +222,7 @@ def advance(view: View, memory: Memory) -> Advance:
     failed = displaced | wrong_side | outside | fell | (stalled >= STALL_STEPS)
     success = (landed > HOLD_STEPS) & ~failed
 
+    terms["cleared"] = CLEARED * success
     near = (x - BAR_X).abs() < 0.1
     height_sum = memory["height_sum"] + z * near
     height_count = memory["height_count"] + near
@@ -257,7 +262,7 @@ def advance(view: View, memory: Memory) -> Advance:
 
 
 def _goal(root: Tensor) -> Tensor:
-    return torch.tensor(GOAL, device=root.device)
+    return constant(GOAL, root.device)
 
 
 def _lowest_over_bar(view: View) -> Tensor:

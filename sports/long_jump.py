@@ -17,7 +17,7 @@ from torch import Tensor
 from sports.humanoid.body import Body
 from sports.physics.base import PhysicsState
 from sports.scene import Scene
-from sports.task import Advance, Memory, Task, View, clamp01, nan_where, progress
+from sports.task import Advance, Memory, Task, View, clamp01, constant, nan_where, progress
 
 LINE_X = 20.0
 START, LINE, GOAL = (0.0, 0.0, 0.0), (LINE_X, 0.0, 0.0), (30.0, 0.0, 1.0)
@@ -76,7 +76,7 @@ def features(view: View, memory: Memory) -> dict[str, Tensor]:
     """Start, line and goal as seen from the athlete (9)."""
     root = view.root_pos
     return {
-        name: view.heading.local(torch.tensor(point, device=root.device) - root)
+        name: view.heading.local(constant(point, root.device) - root)
         for name, point in (("start", START), ("line", LINE), ("goal", GOAL))
     }
 
@@ -85,7 +85,7 @@ def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
     root = view.root_pos[:, 0]
     x, y = root[:, 0], root[:, 1]
-    goal = torch.tensor(GOAL, device=root.device)
+    goal = constant(GOAL, root.device)
     touched = view.touching()[:, 0]  # (N, B) in any substep
     geometry = view.geometry
     points = geometry.world_points(view.physics.body_pos[:, 0], view.physics.body_quat[:, 0])
@@ -173,7 +173,7 @@ def length_bound(speed: Tensor, takeoff_z: Tensor, landing_z: Tensor) -> Tensor:
 
 def _rear(view: View) -> Tensor:
     """(N, B) smallest x of each link."""
-    back = torch.tensor((-1.0, 0.0, 0.0), device=view.clock.device)
+    back = constant((-1.0, 0.0, 0.0), view.clock.device)
     physics = view.physics
     return -view.geometry.extent(physics.body_pos[:, 0], physics.body_quat[:, 0], back)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import torch
@@ -114,6 +115,12 @@ class Task:
     """Whether training starts episodes' truncation clocks at random ages."""
     summary: str = ""
     notes: Mapping[str, str] = field(default_factory=dict)
+
+
+@cache
+def constant(values: tuple[float, ...], device: torch.device) -> Tensor:
+    """A small constant on a device, made once: making it in a step would wait for the device."""
+    return torch.tensor(values, device=device)
 
 
 def progress(before: Tensor, now: Tensor, goal: Tensor) -> Tensor:

@@ -137,7 +137,7 @@ def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
         add(f"pair:{a}:{b}", _side(scene, a), _side(scene, b))
 
 
-def build_spec(scene: Scene) -> mujoco.MjSpec:
+def build_spec(scene: Scene, contact_sensors: bool = True) -> mujoco.MjSpec:
     """The scene as an MjSpec: ground, athletes, objects, actuators, sensors, exclusions."""
     spec = mujoco.MjSpec()
     spec.modelname = scene.name
@@ -164,15 +164,16 @@ def build_spec(scene: Scene) -> mujoco.MjSpec:
         _add_agent(spec, scene, i)
     for obj in scene.objects:
         _add_object(spec, obj)
-    _add_contact_sensors(spec, scene)
+    if contact_sensors:
+        _add_contact_sensors(spec, scene)
     return spec
 
 
-def build_model(scene: Scene | Body) -> mujoco.MjModel:
+def build_model(scene: Scene | Body, contact_sensors: bool = True) -> mujoco.MjModel:
     """Compiles a scene, or one athlete alone on the ground, with ``qpos0`` at its start."""
     if isinstance(scene, Body):
         scene = humanoid_scene(scene)
-    model = build_spec(scene).compile()
+    model = build_spec(scene, contact_sensors).compile()
     if (model.nq, model.nv, model.nu) != (scene.nq, scene.nv, scene.nu):
         raise RuntimeError(f"scene '{scene.name}': compiled model has an unexpected layout")
     return model

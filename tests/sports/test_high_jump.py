@@ -32,6 +32,7 @@ def test_clearing_landing_and_waiting_is_a_success():
     steps = [world.advance({"L_Toe": 800.0}) for _ in range(16)]
     assert [bool(s.terminated[0]) for s in steps] == [False] * 15 + [True]
     assert steps[-1].success[0]
+    assert [float(s.terms["cleared"][0, 0]) for s in steps] == [0.0] * 15 + [10.0]
     assert steps[-1].metrics["height"][0] == pytest.approx(HIGH, abs=1e-5)
 
 

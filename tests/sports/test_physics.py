@@ -109,6 +109,29 @@ def test_mujoco_and_warp_stand_together():
     assert int(w.overflow) == 0 and int(w.nan_worlds) == 0
 
 
+def test_warp_sums_contacts_as_the_sensors_of_mujoco_do():
+    """An athlete thrown onto the bar and one dropped on the ground: forces by link and by pair."""
+    pytest.importorskip("mujoco_warp")
+    scene = make_scene("high_jump", options={"bar_height": 1.0})
+    c = cpu(scene, 2)
+    w = make_physics("warp", scene, 2, device="cpu", iterations=50, line_search=50)
+    state = default_state(scene, 2, "cpu")
+    state.qpos[1, :3] = torch.tensor((19.8, 6.0, 1.1))
+    state.qvel[1, 0] = 3.0
+    ctrl = torch.zeros(2, scene.nu)
+    both = torch.tensor([True, True])
+    pushed = 0.0
+    for physics in (c, w):
+        physics.reset(both, state)
+    for _ in range(6):
+        c.step(ctrl)
+        w.step(ctrl)
+        pushed = max(pushed, float(c.pair_force[1, 0]))
+        assert (c.pair_force - w.pair_force).abs().max() < 0.01 + 1e-3 * c.pair_force.max()
+        assert (c.ground_force - w.ground_force).abs().max() < 0.5
+    assert pushed > 1000.0
+
+
 @pytest.mark.parametrize("task", ["high_jump", "long_jump"])
 def test_permuting_the_worlds_permutes_every_output(task):
     n = 6
