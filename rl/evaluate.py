@@ -47,7 +47,7 @@ class EvaluationResult:
     result: dict[str, Any]
     """The result schema: metrics with 95 % intervals and everything that decides them; JSON."""
     trials: dict[str, np.ndarray]
-    """(trials,) each metric of each trial, NaN where undefined; also ``return`` and ``length``."""
+    """(trials,) each metric of each trial, NaN where undefined; also ``return`` and ``episode_steps``."""
     recordings: dict[str, Recording] = field(default_factory=dict)
     """``best`` and ``median`` by the task's main metric (then by return), and ``world_W`` for
     each world asked for."""
@@ -142,8 +142,8 @@ def evaluate(
     if not isinstance(policy, Policy):
         policy = load_policy(policy, task)
     card = policy.metadata
-    strength = strength or card.get("strength", "paper")
-    limits = limits or card.get("limits", "paper")
+    strength = strength or str(card.get("strength", "paper"))
+    limits = limits or str(card.get("limits", "paper"))
     options = dict(options or {})
     scene = make_scene(
         task,
@@ -315,7 +315,7 @@ def _play_episodes(
     trial_of = np.zeros(env.num_worlds, dtype=int)  # the episode that a world is in
     began = np.zeros(env.num_worlds, dtype=int)
     returns, done = np.zeros(env.num_worlds), 0
-    table = {n: np.full((episodes, env.num_worlds), np.nan) for n in (*names, "return", "length")}
+    table = {n: np.full((episodes, env.num_worlds), np.nan) for n in (*names, "return", "episode_steps")}
     spans: dict[tuple[int, int], tuple[int, int]] = {}
     tape = _Tape(env, job.record or bool(job.worlds_recorded))
     obs, step = env.reset(), 0
@@ -330,12 +330,12 @@ def _play_episodes(
         if not ended.any():
             continue
         metrics = {n: result.metrics[n].double().cpu().numpy() for n in names}
-        for w in np.flatnonzero(ended):
-            e = trial_of[w]
+        for w in np.flatnonzero(ended).tolist():
+            e = int(trial_of[w])
             if e < episodes:
                 for n in names:
                     table[n][e, w] = _settled(metrics[n][w], bad[w], units.get(n, ""))
-                table["return"][e, w], table["length"][e, w] = returns[w], step - began[w]
+                table["return"][e, w], table["episode_steps"][e, w] = returns[w], step - began[w]
                 spans[e, w] = (began[w], step)
                 done += 1
             trial_of[w], began[w], returns[w] = e + 1, step, 0.0
