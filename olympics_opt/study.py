@@ -146,6 +146,7 @@ def make_stages(config: Study, plan: Plan, policy_sha256: str) -> list[Stage]:
                 minutes=config.minutes,
                 seed=config.seed,
                 resume=True,
+                checkpoint_minutes=0.5,
                 options=plan.options,
                 init=config.policy,
                 clips=clips,
@@ -211,7 +212,7 @@ def make_stages(config: Study, plan: Plan, policy_sha256: str) -> list[Stage]:
         Stage("warm_start", "Tracking it in MuJoCo", warm_start, seed, needs=("solve", "certify")),
         Stage(
             "train",
-            f"Fine-tuning a policy for {config.minutes:g} minutes",
+            f"Fine-tuning a policy for {config.minutes:g} min",
             train,
             {
                 **seed,

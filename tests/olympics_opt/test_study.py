@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from olympics_opt import cli
 from olympics_opt.stages import Stage, run_stages
+from sports.humanoid.body import load_body
+from warmstart.certificate import Certificate
+from warmstart.solution import Solution
 
 
 class Log:
@@ -91,3 +97,76 @@ def test_a_torn_manifest_counts_as_not_done(tmp_path: Path):
     (tmp_path / "report" / "stage.json").write_text('{"inputs": ')
     run_stages(tmp_path, line(log), quiet)
     assert log.ran == ["report"]
+
+
+def standing(problem: str, config, out: Path) -> Solution:
+    """In place of the optimiser: an athlete that stands still for a third of a second."""
+    body = load_body("smpl", strength="human")
+    times = np.linspace(0.0, 0.33, 12)
+    qpos = np.zeros((12, 7 + body.num_dofs))
+    qpos[:, 2:4] = body.standing_height(), 1.0
+    solution = Solution(
+        problem=problem,
+        body=body,
+        asked={"bar_height": config.bar_height},
+        strength="human",
+        times=times,
+        qpos=qpos,
+        qvel=np.zeros((12, 6 + body.num_dofs)),
+        qacc=np.zeros((12, 6 + body.num_dofs)),
+        torque=np.zeros((12, body.num_dofs)),
+        contact_points=(("L_Ankle", (0.0, 0.0, -0.05)),),
+        contact_force=np.zeros((12, 1, 3)),
+        phases=(("stand", 0, 11, (0,)),),
+        stats={"solve_s": 0.0},
+    )
+    solution.save(out / "solution.npz")
+    return solution
+
+
+def no_gl(*args, **kwargs):
+    raise RuntimeError("install libegl1")
+
+
+LINE = (
+    *("study", "high_jump", "--policy", "zero", "--minutes", "0.01", "--worlds", "4"),
+    *("--trials", "2", "--drake-trials", "2", "--processes", "1"),
+)
+
+
+def test_a_motion_that_is_not_certified_ends_the_study(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setattr("olympics_opt.solve.optimise", standing)
+    assert cli.main([*LINE, "--out", str(tmp_path)]) == 2
+    assert "not certified" in capsys.readouterr().err
+    assert (tmp_path / "certify" / "certificate.json").is_file()
+    assert not (tmp_path / "warm_start").exists()
+
+
+def test_a_whole_study_and_the_same_again(tmp_path: Path, monkeypatch, capsys):
+    """Every stage but the optimiser and its gate for real, at the smallest size."""
+    monkeypatch.setattr("olympics_opt.solve.optimise", standing)
+    monkeypatch.setattr(Certificate, "passed", property(lambda self: True))
+    monkeypatch.setattr("olympics_opt.study.TRACKING_SEEDS", 1)
+    monkeypatch.setattr("olympics_opt.render.render_video", no_gl)
+    assert cli.main([*LINE, "--out", str(tmp_path)]) == 0
+    page = (tmp_path / "report.html").read_text()
+    assert "No video: install libegl1" in page  # and the rest of the report is whole
+    for words in ("Summary", "Certificate", "Learning", "Shipped and fine-tuned", "Verdict"):
+        assert f">{words}</h2>" in page
+    tuned = json.loads((tmp_path / "evaluate" / "fine-tuned.json").read_text())
+    assert (tuned["trials"], tuned["options"]) == (2, {"bar_height": 1.0})
+    # The athlete that stands cleared no bar, so its motion is no demonstration.
+    assert not (tmp_path / "warm_start" / "demo.npz").exists()
+    capsys.readouterr()
+
+    monkeypatch.setattr("olympics_opt.solve.optimise", None)  # nothing may run again
+    (tmp_path / "report.html").unlink()
+    assert cli.main([*LINE, "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.count("done before") == 7
+    assert (tmp_path / "report.html").read_text() == page
+
+    # More trials: played and reported anew, nothing else.
+    assert cli.main([*LINE, "--out", str(tmp_path), "--trials", "3"]) == 0
+    assert capsys.readouterr().out.count("done before") == 5
+    tuned = json.loads((tmp_path / "evaluate" / "fine-tuned.json").read_text())
+    assert tuned["trials"] == 3
