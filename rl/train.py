@@ -339,7 +339,7 @@ class _Trainer:
         )
         torch.set_num_threads(threads)
         clock.mark()
-        losses = dict.fromkeys(STATISTICS)
+        losses: dict[str, Tensor | None] = {name: None for name in STATISTICS}
         if self.iteration < self.first_learning:
             self.agent.obs_norm.commit()
         else:
@@ -372,7 +372,7 @@ class _Trainer:
             )
         summary = self.meter.summary(values[: len(episode)])
         metrics = {k[8:]: v for k, v in summary.items() if k.startswith("metrics/")}
-        self.metrics |= {k: v for k, v in metrics.items() if v is not None}
+        self.metrics |= {k: v for k, v in metrics.items() if v is not None and math.isfinite(v)}
         took = max(60.0 * (self.minutes - before), 1e-9)
         rollout_s, update_s = clock.laps()
         row |= {
@@ -381,7 +381,7 @@ class _Trainer:
             "samples_per_s": self.samples_each / took,
             "rollout_s": rollout_s,
             "update_s": update_s,
-            **losses,
+            **dict.fromkeys(STATISTICS),
             **losses_now,
             **summary,
         }
@@ -657,10 +657,14 @@ def main(args: list[str] | None = None) -> int:
     """Command line; returns the exit code: 0, or 2 with a sentence for a user's mistake."""
     try:
         summary = train(parse_args(sys.argv[1:] if args is None else args))
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"stopped by {summary.stopped_by} after {summary.samples} samples: {summary.checkpoint}")
+    if os.environ.get("RANK", "0") == "0":
+        print(
+            f"stopped by {summary.stopped_by} after {summary.samples} samples; last checkpoint "
+            f"{summary.checkpoint}"
+        )
     return 0
 
 

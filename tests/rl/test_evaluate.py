@@ -115,7 +115,7 @@ def test_recordings_are_the_episodes_they_name(played):
     for name, trial in (("best", order[-1]), ("median", order[len(order) // 2]), ("world_2", 2)):
         recording = played.recordings[name]
         assert recording.world == trial % 6
-        assert len(recording.qpos) == played.trials["length"][trial]
+        assert len(recording.qpos) == played.trials["episode_steps"][trial]
         assert recording.reward.sum() == pytest.approx(returns[trial], abs=1e-4)
         np.testing.assert_allclose(sum(recording.terms.values()), recording.reward, atol=1e-5)
         assert recording.metrics["bar_height"] == pytest.approx(1.0 if trial % 2 == 0 else 1.5)
@@ -189,7 +189,7 @@ def test_drake_trials_in_processes(processes):
     result = evaluate("zero", "high_jump", engine="drake", trials=4, processes=processes, record=1)
     assert result.result["metrics"]["success"]["n"] == 4
     np.testing.assert_allclose(result.trials["bar_height"], [1.0, 1.5, 1.0, 1.5])
-    assert len(result.median.qpos) in result.trials["length"]
+    assert len(result.median.qpos) in result.trials["episode_steps"]
     # standing at PD target zero ends by the stall rule at the same step in both engines
     mujoco = evaluate("zero", "high_jump", trials=4)
-    np.testing.assert_array_equal(mujoco.trials["length"], result.trials["length"])
+    np.testing.assert_array_equal(mujoco.trials["episode_steps"], result.trials["length"])
