@@ -421,8 +421,9 @@ def _table(rows: Sequence[Row]) -> Any:
     from rich.table import Table
 
     table = Table(title="Speed (per second; shares of bare physics within the same turns)")
-    for name in ("task", "engine", "worlds", "bare physics", "environment", "training", "memory"):
-        table.add_column(name, justify="left" if name in ("task", "engine") else "right")
+    for name in ("task", "engine", "worlds", "bare", "environment", "training", "memory"):
+        side = "left" if name in ("task", "engine") else "right"
+        table.add_column(name, justify=side, no_wrap=True)
 
     def cell(rate: float | None, share: float | None, wanted: float | None) -> str:
         if rate is None or share is None:
@@ -438,7 +439,7 @@ def _table(rows: Sequence[Row]) -> Any:
             memory += f" + {r.device_memory_gib:.1f} GPU"
         table.add_row(
             r.task,
-            f"{r.engine}, {r.substeps} x 1/{1 / r.timestep:.0f} s",
+            f"{r.engine} {r.substeps} x 1/{1 / r.timestep:.0f}",
             str(r.worlds),
             _rate(r.bare_physics),
             cell(r.environment, r.environment_share, ENVIRONMENT_SHARE),
