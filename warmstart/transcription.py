@@ -64,7 +64,7 @@ class Weights:
     """On the integral of the squared rate of force over body weight (per s)."""
     acceleration: float = 2e-3
     """On the integral of squared joint acceleration over 50 rad/s^2."""
-    acceleration_rate: float = 2e-4
+    acceleration_rate: float = 4e-4
     """On the integral of the squared rate of joint acceleration over 50 rad/s^2 (per s)."""
 
 

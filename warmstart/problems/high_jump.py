@@ -41,6 +41,8 @@ class Config:
     """Least distance of the body over the bar at knots (m)."""
     approach_speed: tuple[float, float] = (2.0, 7.0)
     """Forward speed of the centre of mass at touch-down of the take-off foot (m/s)."""
+    detail: float = 1.0
+    """Knots relative to the standard grid; below 1 solves faster and is less exact."""
     max_iterations: int = 300
     """IPOPT iterations before giving up."""
 
@@ -52,6 +54,7 @@ class Config:
             )
         if not 0.0 <= self.clearance <= 0.3:
             raise ValueError(f"clearance must lie between 0 and 0.3 m, not {self.clearance}")
+        jumper.check_options(self.detail, self.max_iterations)
         low, high = self.approach_speed
         if not 0.0 <= low <= high <= 11.0:
             raise ValueError(
@@ -70,10 +73,11 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     """The nonlinear program; its parameter is the bar's height plus the clearance."""
     body = load_body("smpl", strength=config.strength)
     model = jumper.make_model(body)
+    knots = jumper.scaled(config.detail)
     phases = [
-        Phase("flat", 14, (0.09, 0.30), {"L": "flat"}),
-        Phase("toe", 8, (0.04, 0.15), {"L": "toe"}),
-        Phase("flight", 36, (0.30, 1.20), grading=3.0),
+        Phase("flat", knots(14), (0.09, 0.30), {"L": "flat"}),
+        Phase("toe", knots(8), (0.04, 0.15), {"L": "toe"}),
+        Phase("flight", knots(36), (0.30, 1.20), grading=3.0),
     ]
     position = jumper.boxes(jumper.POSITION) | {
         "x": (BAR_X - 5, BAR_X + 3),

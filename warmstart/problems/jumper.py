@@ -70,6 +70,19 @@ RATE = {
 """Rate boxes of the root (m/s, rad/s)."""
 
 
+def check_options(detail: float, max_iterations: int) -> None:
+    """Raises ValueError for options that no jump accepts."""
+    if not 0.3 <= detail <= 4.0:
+        raise ValueError(f"detail must lie between 0.3 and 4, not {detail}")
+    if max_iterations < 1:
+        raise ValueError(f"max_iterations must be at least 1, not {max_iterations}")
+
+
+def scaled(detail: float) -> Callable[[int], int]:
+    """Intervals of a phase at a level of detail."""
+    return lambda intervals: max(3, round(intervals * detail))
+
+
 def make_model(body: Body) -> ReducedModel:
     """The athlete of both jumps: 6 + 20 coordinates."""
     return reduce_tree(load_tree(body), FREE, POSE)

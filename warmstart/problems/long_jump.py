@@ -36,6 +36,8 @@ class Config:
     """Distance of the take-off toe before the line, at least (m)."""
     approach_speed: tuple[float, float] = (3.0, 9.5)
     """Forward speed of the centre of mass at touch-down of the take-off foot (m/s)."""
+    detail: float = 1.0
+    """Knots relative to the standard grid; below 1 solves faster and is less exact."""
     max_iterations: int = 300
     """IPOPT iterations before giving up."""
 
@@ -47,6 +49,7 @@ class Config:
             )
         if not 0.0 <= self.board <= 0.5:
             raise ValueError(f"board must lie between 0 and 0.5 m, not {self.board}")
+        jumper.check_options(self.detail, self.max_iterations)
         low, high = self.approach_speed
         if not 0.0 <= low <= high <= 11.0:
             raise ValueError(
@@ -58,10 +61,11 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     """The nonlinear program; its parameter is the length."""
     body = load_body("smpl", strength=config.strength)
     model = jumper.make_model(body)
+    knots = jumper.scaled(config.detail)
     phases = [
-        Phase("flat", 16, (0.075, 0.25), {"L": "flat"}, grading=2.0),
-        Phase("toe", 9, (0.045, 0.12), {"L": "toe"}),
-        Phase("flight", 48, (0.25, 1.20), grading=4.0),
+        Phase("flat", knots(16), (0.075, 0.25), {"L": "flat"}, grading=2.0),
+        Phase("toe", knots(9), (0.045, 0.12), {"L": "toe"}),
+        Phase("flight", knots(60), (0.25, 1.20), grading=3.0),
     ]
     position = jumper.boxes(jumper.POSITION) | {
         "x": (LINE_X - 3, LINE_X + 12),
