@@ -161,7 +161,7 @@ class Study:
     """Worlds simulated at a time while training."""
     trials: int = 100
     """Episodes of each policy in MuJoCo."""
-    drake_trials: int = 20
+    drake_trials: int = 40
     """Episodes in Drake."""
     seed: int = 0
     """Seed of all randomness."""
