@@ -420,30 +420,37 @@ def bench(
 def _table(rows: Sequence[Row]) -> Any:
     from rich.table import Table
 
-    table = Table(title="Speed (per second; shares of bare physics within the same turns)")
-    for name in ("task", "engine", "worlds", "bare", "environment", "training", "memory"):
+    table = Table(
+        title="Per second; shares of bare physics within the same turns",
+        title_justify="left",
+        box=None,
+    )
+    heads = ("task", "engine", "worlds", "bare", "environment", "share", "training", "share")
+    for name in (*heads, "GiB"):
         side = "left" if name in ("task", "engine") else "right"
         table.add_column(name, justify=side, no_wrap=True)
 
-    def cell(rate: float | None, share: float | None, wanted: float | None) -> str:
-        if rate is None or share is None:
-            return "-"
-        color = "" if wanted is None else "green" if share >= wanted else "red"
-        text = f"{_rate(rate)}  {100 * share:.0f} %"
+    def share(value: float | None, wanted: float | None) -> str:
+        if value is None:
+            return ""
+        text = f"{100 * value:.0f} %"
+        color = "" if wanted is None else "green" if value >= wanted else "red"
         return f"[{color}]{text}[/]" if color else text
 
     for r in rows:
         wanted = TRAINING_SHARE if r.engine == "warp" else None
-        memory = f"{r.host_memory_gib:.1f} GiB"
+        memory = f"{r.host_memory_gib:.1f}"
         if r.device_memory_gib is not None:
-            memory += f" + {r.device_memory_gib:.1f} GPU"
+            memory += f"+{r.device_memory_gib:.1f}"
         table.add_row(
             r.task,
-            f"{r.engine} {r.substeps} x 1/{1 / r.timestep:.0f}",
+            r.engine,
             str(r.worlds),
             _rate(r.bare_physics),
-            cell(r.environment, r.environment_share, ENVIRONMENT_SHARE),
-            cell(r.training, r.training_share, wanted),
+            _rate(r.environment),
+            share(r.environment_share, ENVIRONMENT_SHARE),
+            _rate(r.training) if r.training else "-",
+            share(r.training_share, wanted),
             memory,
         )
     return table
