@@ -425,7 +425,7 @@ def _table(rows: Sequence[Row]) -> Any:
         title_justify="left",
         box=None,
     )
-    heads = ("task", "engine", "worlds", "bare", "environment", "share", "training", "share")
+    heads = ("task", "engine", "worlds", "physics", "env", "share", "train", "share")
     for name in (*heads, "GiB"):
         side = "left" if name in ("task", "engine") else "right"
         table.add_column(name, justify=side, no_wrap=True)
