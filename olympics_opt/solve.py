@@ -6,6 +6,7 @@ it in MuJoCo with feedback. Only what passed is written as a demonstration.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ SOLUTION, DEMO, CERTIFICATE, PREVIEW = (
 
 
 def run_solve(config: Solve) -> int:
-    """The command: 0 with a demonstration, 1 when the certificate refuses the motion.
+    """The command: 0 with a demonstration, 1 when the certificate or the tracking refuses it.
 
     Raises ValueError for an unknown problem or option, ``Infeasible`` naming the constraint that
     stopped the optimiser.
@@ -40,18 +41,19 @@ def run_solve(config: Solve) -> int:
     problem_config = config.problem  # type: ignore[attr-defined]  # added by the command line
     if config.sweep is not None:
         return _run_sweep(config, chosen_options(config, "problem"))
+    (config.out / DEMO).unlink(missing_ok=True)  # of an earlier solve with other options
     solution = optimise(config.name, problem_config, config.out)
     certificate = certify_solution(solution, config.out)
     tracked = None
     if certificate.passed and config.track:
-        tracked = track_clip(solution, config.out)
+        tracked = track_clip(solution, certificate, config.out)
     elif certificate.passed:
         from warmstart.clip import clip_from_solution
 
         clip_from_solution(solution).save(config.out / DEMO)
     write_preview(solution, certificate, tracked, config.out / PREVIEW)
     _print_outcome(solution, certificate, tracked, config.out)
-    return 0 if certificate.passed else 1
+    return 0 if (config.out / DEMO).is_file() else 1
 
 
 def optimise(problem: str, problem_config: Any, out: Path) -> Solution:
@@ -82,18 +84,30 @@ def certify_solution(solution: Solution, out: Path) -> Certificate:
     return certificate
 
 
-def track_clip(solution: Solution, out: Path, seed: int = 0) -> Tracked:
-    """Follows a certified solution in MuJoCo with feedback and writes demo.npz."""
-    from warmstart.tracking import Tracking, track
+def track_clip(solution: Solution, certificate: Certificate, out: Path, seed: int = 0) -> Tracked:
+    """Follows a certified solution in MuJoCo with feedback; writes demo.npz where it succeeds.
+
+    Success is what the task's own rules call so; the clip is labelled with what it achieved.
+    """
+    from warmstart.tracking import Tracking, track_best
 
     with progress("tracking in MuJoCo") as bar:
-        tracked = track(
+        tracked = track_best(
             solution,
             settings=Tracking(seed=seed),
             progress=lambda i, n: bar.show(f"step {i} of {n}", i, n),
         )
-        bar.finish(f"links {100 * tracked.link_error:.1f} cm off")
-    tracked.clip.save(out / DEMO)
+        word = "success" if tracked.success else "no success"
+        bar.finish(f"{word}, links {100 * tracked.link_error:.1f} cm off")
+    if tracked.success:
+        meta = {
+            **tracked.clip.meta,
+            "certified": certificate.passed,
+            "planned": certificate.achieved.get("planned"),
+            "link_error": tracked.link_error,
+            "root_error": tracked.root_error,
+        }
+        replace(tracked.clip, meta=meta).save(out / DEMO)
     return tracked
 
 
@@ -205,7 +219,7 @@ def motion_replay(solution: Solution, tracked: Clip | None) -> Section:
     from olympics_opt.report.page import Fragment, Section
     from olympics_opt.report.replay import ReplayTrack, replay_html
     from warmstart.clip import clip_from_solution
-    from warmstart.tracking import scene_of
+    from warmstart.replay import scene_of
 
     clip = clip_from_solution(solution, 60.0)
     tracks = [ReplayTrack.from_clip(clip, "optimised")]
@@ -235,10 +249,12 @@ def _print_outcome(
                 f"{k} {number(float(v))}" for k, v in tracked.clip.meta.get("achieved", {}).items()
             )
         )
-    if certificate.passed:
-        print(f"wrote {out / DEMO}, {out / CERTIFICATE} and {out / PREVIEW}")
-    else:
+    if not certificate.passed:
         print(f"not certified, so no demonstration is written: {'; '.join(certificate.failures)}")
+    elif not (out / DEMO).is_file():
+        print("certified, but MuJoCo did not succeed with it: no demonstration is written")
+    names = (n for n in (DEMO, CERTIFICATE, PREVIEW) if (out / n).is_file())
+    print(f"wrote {', '.join(str(out / n) for n in names)}")
 
 
 def _run_sweep(config: Solve, options: dict[str, Any]) -> int:

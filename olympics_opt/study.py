@@ -39,8 +39,6 @@ PLANS: dict[str, Plan] = {
     "high_jump": Plan("high_jump", 1.0, options={"bar_height": 1.0}),
     "long_jump": Plan("long_jump", 5.0),
 }
-TRACKING_SEEDS = 3
-"""Tries of the tracker before a motion counts as not trackable."""
 
 START_PROBABILITY = (0.5, 0.1)
 """Share of training episodes that start from a state of the tracked motion: first, last."""
@@ -112,22 +110,18 @@ def make_stages(config: Study, plan: Plan, policy_sha256: str) -> list[Stage]:
 
     def warm_start(folder: Path) -> dict[str, Any]:
         from olympics_opt.solve import track_clip
+        from warmstart.certificate import Certificate
         from warmstart.solution import Solution
 
         solution = Solution.load(out / "solve" / SOLUTION)
-        for seed in range(config.seed, config.seed + TRACKING_SEEDS):
-            tracked = track_clip(solution, folder, seed)
-            achieved = tracked.clip.meta.get("achieved", {})
-            if achieved.get("success", 0.0) > 0.5:
-                break
-        else:
-            (folder / DEMO).unlink()  # only what succeeds is a demonstration
+        certificate = Certificate.from_json(out / "certify" / CERTIFICATE)
+        tracked = track_clip(solution, certificate, folder, config.seed)
         return {
-            "seed": seed,
-            "success": achieved.get("success", 0.0) > 0.5,
-            "achieved": achieved,
+            "success": tracked.success,
+            "achieved": tracked.clip.meta.get("achieved", {}),
             "link_error": tracked.link_error,
             "root_error": tracked.root_error,
+            "seconds": tracked.seconds,
         }
 
     def train(folder: Path) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from olympics_opt.stages import Stage, run_stages
 from sports.humanoid.body import load_body
 from warmstart.certificate import Certificate
 from warmstart.solution import Solution
+from warmstart.tracking import track
 
 
 class Log:
@@ -146,7 +147,7 @@ def test_a_whole_study_and_the_same_again(tmp_path: Path, monkeypatch, capsys):
     """Every stage but the optimiser and its gate for real, at the smallest size."""
     monkeypatch.setattr("olympics_opt.solve.optimise", standing)
     monkeypatch.setattr(Certificate, "passed", property(lambda self: True))
-    monkeypatch.setattr("olympics_opt.study.TRACKING_SEEDS", 1)
+    monkeypatch.setattr("warmstart.tracking.track_best", track)  # one attempt is enough here
     monkeypatch.setattr("olympics_opt.render.render_video", no_gl)
     assert cli.main([*LINE, "--out", str(tmp_path)]) == 0
     page = (tmp_path / "report.html").read_text()
