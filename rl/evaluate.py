@@ -47,7 +47,8 @@ class EvaluationResult:
     result: dict[str, Any]
     """The result schema: metrics with 95 % intervals and everything that decides them; JSON."""
     trials: dict[str, np.ndarray]
-    """(trials,) each metric of each trial, NaN where undefined; also ``return`` and ``episode_steps``."""
+    """(trials,) each metric of each trial, NaN where undefined; also its ``return`` and
+    ``episode_steps``."""
     recordings: dict[str, Recording] = field(default_factory=dict)
     """``best`` and ``median`` by the task's main metric (then by return), and ``world_W`` for
     each world asked for."""
@@ -315,7 +316,9 @@ def _play_episodes(
     trial_of = np.zeros(env.num_worlds, dtype=int)  # the episode that a world is in
     began = np.zeros(env.num_worlds, dtype=int)
     returns, done = np.zeros(env.num_worlds), 0
-    table = {n: np.full((episodes, env.num_worlds), np.nan) for n in (*names, "return", "episode_steps")}
+    table = {
+        n: np.full((episodes, env.num_worlds), np.nan) for n in (*names, "return", "episode_steps")
+    }
     spans: dict[tuple[int, int], tuple[int, int]] = {}
     tape = _Tape(env, job.record or bool(job.worlds_recorded))
     obs, step = env.reset(), 0

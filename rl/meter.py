@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_HEAD = ("steps", "invalid", "episodes", "return", "length")
+_HEAD = ("steps", "invalid", "episodes", "return", "episode_steps")
 
 
 class EpisodeMeter:
@@ -61,7 +61,7 @@ class EpisodeMeter:
             "episodes": int(episodes),
             "invalid": int(invalid),
             "return": returns / episodes if episodes else None,
-            "length": lengths / episodes if episodes else None,
+            "episode_steps": lengths / episodes if episodes else None,
         }
         at = len(_HEAD)
         for name in self._metrics:

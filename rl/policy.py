@@ -188,7 +188,11 @@ def _from_file(path: Path) -> Policy:
         raise PolicyError(f"'{card_path}' is not the card of a policy of this project")
     if card.get("sha256") != hashlib.sha256(data).hexdigest():
         raise PolicyError(f"'{path}' does not belong to its card: the sha256 differs")
-    return _build(card, {k: v.float() for k, v in weights.items()}, str(path))
+    extra = {k: v for k, v in weights.items() if k.startswith(("critic.", "value_norm."))}
+    actor = {k: v.float() for k, v in weights.items() if k not in extra}
+    policy = _build(card, actor, str(path))
+    policy.extra = {k: v.float() if k.startswith("critic.") else v for k, v in extra.items()}
+    return policy
 
 
 def _build(card: dict[str, Any], weights: dict[str, Tensor], where: str) -> Policy:
@@ -218,7 +222,12 @@ def _build(card: dict[str, Any], weights: dict[str, Tensor], where: str) -> Poli
 
 
 def export_policy(
-    run: Path | str, out: Path | str, *, metrics: dict[str, Any] | None = None, looks: str = ""
+    run: Path | str,
+    out: Path | str,
+    *,
+    metrics: dict[str, Any] | None = None,
+    looks: str = "",
+    critic: bool = False,
 ) -> Path:
     """Writes a run's actor as ``OUT.safetensors`` (fp16) and ``OUT.json``; returns the former.
 
@@ -227,12 +236,19 @@ def export_policy(
         out: target; any suffix becomes ``.safetensors``.
         metrics: an evaluation's metrics for the card; the run's last ones if None.
         looks: what the motion looks like, in words.
+        critic: keep the critic too, so that fine-tuning need not begin without one.
 
     Raises PolicyError when the run has no readable checkpoint.
     """
     policy = _from_run(Path(run))
     assert policy.actor is not None
-    weights = {k: v.half().contiguous() for k, v in policy.actor.state_dict().items()}
+    weights = dict(policy.actor.state_dict())
+    if critic:
+        weights |= policy.extra
+    weights = {  # running moments stay in float64
+        k: v.contiguous() if k.startswith("value_norm.") else v.half().contiguous()
+        for k, v in weights.items()
+    }
     if not all(torch.isfinite(v).all() for v in weights.values()):
         raise PolicyError(f"the weights of run '{run}' do not fit fp16")
     data = save(weights)

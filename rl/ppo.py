@@ -267,6 +267,8 @@ class PPO:
 
     def _prepare_batch(self, r: Rollout, value: Tensor) -> None:
         """Flat views (T M, ...) and the quantities that every minibatch needs."""
+        if self._step.graph is not None and self._batch["obs"].data_ptr() != r.obs.data_ptr():
+            raise ValueError("the captured update reads the first rollout: fill that one again")
         valid = r.valid.double()
         a = r.advantages.double()
         sums = torch.stack((valid.sum(), (valid * a).sum(), (valid * a * a).sum()))

@@ -108,7 +108,16 @@ def _text(value: float | int | None) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
-_SHOWN = ("samples", "minutes", "samples_per_s", "return", "length", "kl", "learning_rate", "sigma")
+_SHOWN = (
+    "samples",
+    "minutes",
+    "samples_per_s",
+    "return",
+    "episode_steps",
+    "kl",
+    "learning_rate",
+    "sigma",
+)
 
 
 def _line(row: Row, share: float) -> str:

@@ -339,15 +339,15 @@ class _Trainer:
         )
         torch.set_num_threads(threads)
         clock.mark()
-        losses: dict[str, Tensor | None] = {name: None for name in STATISTICS}
+        losses: dict[str, Tensor] = {}
         if self.iteration < self.first_learning:
             self.agent.obs_norm.commit()
         else:
-            losses |= self.agent.update(self.rollout)
+            losses = self.agent.update(self.rollout)
         clock.mark()
         row: Row = {"iteration": self.iteration + 1}
-        numbers = {k: v for k, v in losses.items() if v is not None}
-        numbers |= {"learning_rate": self.agent.learning_rate, "sigma": self.agent.sigma}
+        agent = self.agent
+        numbers = {**losses, "learning_rate": agent.learning_rate, "sigma": agent.sigma}
         names = list(numbers)
         tail = torch.stack([x.double().to(self.device) for x in numbers.values()])
         episode = self.meter.totals().to(self.device)

@@ -172,6 +172,14 @@ def test_half_the_time_step_and_options_reach_the_engine():
     np.testing.assert_allclose(result.trials["bar_height"], 1.2)
 
 
+def test_a_tasks_own_metrics_are_not_hidden():
+    """Long jump has a metric "length" (m), undefined where nobody jumped."""
+    result = evaluate("zero", "long_jump", trials=3)
+    assert np.isnan(result.trials["length"]).all()
+    assert (result.trials["episode_steps"] > 0).all()
+    assert result.result["metrics"]["length"] == {"mean": None, "ci95": None, "n": 0, "unit": "m"}
+
+
 def test_mistakes_are_sentences():
     with pytest.raises(ValueError, match="unknown task"):
         evaluate("zero", "chess")
@@ -192,4 +200,4 @@ def test_drake_trials_in_processes(processes):
     assert len(result.median.qpos) in result.trials["episode_steps"]
     # standing at PD target zero ends by the stall rule at the same step in both engines
     mujoco = evaluate("zero", "high_jump", trials=4)
-    np.testing.assert_array_equal(mujoco.trials["episode_steps"], result.trials["length"])
+    np.testing.assert_array_equal(mujoco.trials["episode_steps"], result.trials["episode_steps"])

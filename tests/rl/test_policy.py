@@ -79,6 +79,23 @@ def test_a_loaded_policy_behaves_as_in_training(run):
     torch.testing.assert_close(torch.stack(seen[:-1])[:, :, 0], rollout.mean)
 
 
+def test_a_critic_travels_along_where_asked(run, tmp_path):
+    from rl.ppo import PPO
+    from tests.rl.toy import SMALL
+
+    whole = load_policy(run, "toy")
+    path = export_policy(run, tmp_path / "with", critic=True)
+    policy = load_policy(path, "toy")
+    obs = torch.randn(20, 2)
+    torch.testing.assert_close(policy(obs), whole(obs), atol=2e-3, rtol=2e-3)
+    agents = [PPO(2, 1, SMALL, seed=s) for s in (1, 2)]
+    assert all(agent.load_critic(p.extra) for agent, p in zip(agents, (policy, whole)))
+    values = [agent.value(obs) for agent in agents]
+    torch.testing.assert_close(values[0], values[1], atol=1e-2, rtol=1e-2)
+    alone = load_policy(export_policy(run, tmp_path / "without"), "toy")
+    assert not agents[0].load_critic(alone.extra)
+
+
 def refuse(source: object, match: str, task: str = "toy") -> None:
     with pytest.raises(PolicyError, match=match) as caught:
         load_policy(source, task)  # type: ignore[arg-type]
