@@ -221,6 +221,16 @@ def _build(card: dict[str, Any], weights: dict[str, Tensor], where: str) -> Poli
     return Policy(actor, mean, std, card)
 
 
+def _portable(config: dict[str, Any]) -> dict[str, Any]:
+    """A run's settings without what is only true on the machine where it ran."""
+    config = {k: v for k, v in config.items() if k not in ("out", "resume", "quiet", "device")}
+    if isinstance(config.get("clips"), list):
+        config["clips"] = [Path(p).name for p in config["clips"]]
+    if config.get("init"):
+        config["init"] = Path(config["init"]).name
+    return config
+
+
 def export_policy(
     run: Path | str,
     out: Path | str,
@@ -253,6 +263,7 @@ def export_policy(
         raise PolicyError(f"the weights of run '{run}' do not fit fp16")
     data = save(weights)
     card = dict(policy.metadata) | {"sha256": hashlib.sha256(data).hexdigest()}
+    card["config"] = _portable(card.get("config", {}))
     if metrics is not None:
         card["metrics"] = metrics
     if looks:

@@ -216,7 +216,9 @@ class _Trainer:
         self.resumed = config.resume and bool(checkpoints(config.out))
         fresh = config.init and not self.resumed
         policy = load_policy(str(config.init), config.task) if fresh else None
-        if policy is not None and policy.actor is not None and not config.paper:
+        if policy is not None and policy.actor is None:
+            raise ValueError(f"--init {config.init} is a baseline: there is nothing to start from")
+        if policy is not None and not config.paper:
             card = policy.metadata
             shape = {"hidden": tuple(card["hidden"]), "activation": card["activation"]}
             config = replace(config, ppo=replace(config.ppo, **shape))
@@ -251,7 +253,7 @@ class _Trainer:
             self.obs = self._restore()
         else:
             self.obs = self.env.reset()
-            if policy is not None and policy.actor is not None:
+            if policy is not None and policy.actor is not None:  # never a baseline here
                 policy.check(self.env)
                 count = policy.metadata["obs_count"]
                 self.agent.load_policy(policy.actor, policy.mean, policy.std, count)

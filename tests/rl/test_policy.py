@@ -58,6 +58,7 @@ def test_the_card_says_what_it_is(file):
     for name in ("config", "minutes", "hardware", "commit", "versions", "metrics", "sha256"):
         assert card[name], name
     assert load_file(file)["head.weight"].dtype == torch.float16
+    assert str(file.parent) not in file.with_suffix(".json").read_text()
 
 
 def test_a_loaded_policy_behaves_as_in_training(run):
