@@ -19,6 +19,7 @@ from sports.humanoid.body import Strength, load_body
 from warmstart.contact import Ball, outline
 from warmstart.nlp import Result
 from warmstart.problems import jumper
+from warmstart.separation import keep_apart
 from warmstart.solution import Solution
 from warmstart.transcription import Bounds, Phase, Transcription
 
@@ -95,7 +96,8 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
         parameters=1,
         elastic=elastic,
     )
-    jumper.start_rows(program, config.approach_speed, sink=(-1.2, -0.1), limb_rate=8.0)
+    keep_apart(program, body, np.arange(program.K))
+    jumper.start_rows(program, config.approach_speed, sink=(-1.2, -0.1), limb_rate=12.0)
     flight = program.knots("flight")
     wide = ("Ankle", "Toe", "Pelvis")
     balls = [b for b in outline(body) if b.link.endswith(wide)]

@@ -130,7 +130,7 @@ def start_rows(
     program.bound(program.v[0, 6:], -limb_rate, limb_rate)
     limits = {
         "z": (0.80, 1.1),
-        "pitch": (-0.3, 0.25),
+        "pitch": (-0.45, 0.25),
         "roll": (-0.15, 0.15),
         "yaw": (-0.3, 0.3),
         "R_Hip_y": (-0.3, 0.6),

@@ -18,6 +18,7 @@ from warmstart.contact import outline
 from warmstart.nlp import Result
 from warmstart.problems import jumper
 from warmstart.rigid_body import center_of_mass
+from warmstart.separation import keep_apart
 from warmstart.solution import Solution
 from warmstart.transcription import Bounds, Phase, Transcription
 
@@ -83,6 +84,7 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
         parameters=1,
         elastic=elastic,
     )
+    keep_apart(program, body, np.arange(program.K))
     jumper.start_rows(program, config.approach_speed, sink=(-0.8, -0.1), limb_rate=12.0)
     left, right = jumper.foot(body, "L"), jumper.foot(body, "R")
     corners = [b for b in outline(body) if b.link in ("L_Ankle", "L_Toe")]
