@@ -18,10 +18,11 @@ import numpy as np
 from sports.humanoid.body import Strength, load_body
 from warmstart.contact import Ball, outline
 from warmstart.nlp import Result
+from warmstart.phases import Bounds, Phase
 from warmstart.problems import jumper
 from warmstart.separation import keep_apart
 from warmstart.solution import Solution
-from warmstart.transcription import Bounds, Phase, Transcription
+from warmstart.transcription import Transcription
 
 BAR_X, LANE_Y = 20.0, 6.0
 _PARABOLA = 8.0

@@ -11,10 +11,11 @@ from scipy.interpolate import PchipInterpolator
 from sports.humanoid.body import Body
 from warmstart.contact import Ball, outline
 from warmstart.nlp import Result
+from warmstart.phases import ELASTIC_REACH
 from warmstart.problems import Infeasible
 from warmstart.rigid_body import ReducedModel, center_of_mass, load_tree, reduce_tree
 from warmstart.solution import Solution
-from warmstart.transcription import ELASTIC_REACH, Transcription
+from warmstart.transcription import Transcription
 
 LEGS = ("Hip_x", "Hip_y", "Hip_z", "Knee_y", "Ankle_x", "Ankle_y", "Toe_y")
 FREE = (

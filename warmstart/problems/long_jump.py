@@ -16,11 +16,12 @@ import numpy as np
 from sports.humanoid.body import Strength, load_body
 from warmstart.contact import outline
 from warmstart.nlp import Result
+from warmstart.phases import Bounds, Phase
 from warmstart.problems import jumper
 from warmstart.rigid_body import center_of_mass
 from warmstart.separation import keep_apart
 from warmstart.solution import Solution
-from warmstart.transcription import Bounds, Phase, Transcription
+from warmstart.transcription import Transcription
 
 LINE_X = 20.0
 

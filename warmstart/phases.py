@@ -1,0 +1,64 @@
+"""What a motion is made of: phases with contacts, boxes of its coordinates, cost weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+HEEL, TOE = (0, 1), (2, 3, 4, 5)
+ELASTIC_REACH = 4.0
+"""An elastic program may use this multiple of a torque limit."""
+ELASTIC_PRICE = 10.0
+"""Cost of one unit of a joint's torque limit in an elastic program."""
+MODES = {"flat": (*HEEL, *TOE), "toe": TOE}
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of the motion with constant contacts."""
+
+    name: str
+    intervals: int
+    duration: tuple[float, float]
+    """Shortest and longest duration (s)."""
+    feet: Mapping[str, str] = field(default_factory=dict)
+    """Contact mode by side, e.g. ``{"L": "flat"}``; modes: ``flat``, ``toe``."""
+    grading: float = 1.0
+    """Length of the later intervals over the first: small steps where motion is abrupt."""
+
+    def spacing(self) -> np.ndarray:
+        """(intervals,) lengths relative to their mean: growing over the first third, then equal."""
+        i = np.arange(self.intervals) / max(self.intervals / 3, 1)
+        w = np.minimum(1 / self.grading + (1 - 1 / self.grading) * i, 1.0)
+        return w / w.mean()
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Cost weights. Effort is the integral of the squared torque over its limit."""
+
+    effort: float = 1.0
+    torque_rate: float = 3e-3
+    """On the integral of the squared rate of torque over its limit (per s)."""
+    force_rate: float = 2e-4
+    """On the integral of the squared rate of force over body weight (per s)."""
+    acceleration: float = 2e-3
+    """On the integral of squared joint acceleration over 50 rad/s^2."""
+    acceleration_rate: float = 4e-4
+    """On the integral of the squared rate of joint acceleration over 50 rad/s^2 (per s)."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Boxes of the reduced coordinates (K-independent), by coordinate name."""
+
+    position: Mapping[str, tuple[float, float]]
+    rate: Mapping[str, tuple[float, float]]
+    acceleration: float = 400.0
+    friction_x: float = 0.8
+    """|f_x| <= friction_x f_z; with friction_y inside the circle of the ground's mu = 1."""
+    friction_y: float = 0.5
+    torque_share: float = 0.97
+    """Share of the torque limit that the optimiser may use at knots."""
