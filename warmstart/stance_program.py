@@ -309,13 +309,14 @@ class StanceProgram:
             worst = np.maximum(worst, np.maximum(lower - y, y - upper).max(initial=0.0))
         return float(worst)
 
-    def stationarity(self, x: np.ndarray, near: float = 1e-4) -> float:
+    def stationarity(self, x: np.ndarray, near: float = 1e-3) -> float:
         """Relative first-order residual |g - J' lam| / |g| at a point, by Drake's AutoDiff.
 
         g is the cost gradient over the variables that are not at a bound, J the rows that are
-        active within ``near`` (equalities always), lam the multipliers of least squares. Zero
-        at an optimum. Needs no solver (Nocedal and Wright, Numerical Optimization, section
-        12.3); the signs of the multipliers are left to SNOPT.
+        active within ``near`` (equalities always; interior-point solutions keep a small
+        distance), lam the multipliers of least squares. Zero at an optimum. Needs no solver
+        (Nocedal and Wright, Numerical Optimization, section 12.3); the signs of the multipliers
+        are left to SNOPT.
         """
         program = self.program
         g, at_bound = np.zeros(len(x)), np.zeros(len(x), dtype=bool)
