@@ -63,9 +63,15 @@ def run_study(config: Study) -> int:
         raise ValueError(f"there is no study of '{config.name}'; there is: {', '.join(PLANS)}")
     plan = PLANS[config.name]
     # An unusable policy is told before anything is solved.
-    digest = load_policy(config.policy, config.name).metadata["sha256"]
-    stages = make_stages(config, plan, digest)
-    done = run_stages(config.out, stages)
+    policy = load_policy(config.policy, config.name)
+    if policy.actor is None:
+        raise ValueError(f"'{config.policy}' is a baseline: a study fine-tunes a trained policy")
+    stages = make_stages(config, plan, policy.metadata["sha256"])
+    try:
+        done = run_stages(config.out, stages)
+    except KeyboardInterrupt:
+        print("\nThe study stops here; the same command continues it.")
+        raise
     atomic.write_bytes(config.out / REPORT, (config.out / "report" / REPORT).read_bytes())
     total = sum(d.seconds for d in done.values())
     print(f"study of {config.name}: {total / 60:.1f} minutes in all")
@@ -154,7 +160,7 @@ def make_stages(config: Study, plan: Plan, policy_sha256: str) -> list[Stage]:
             "samples": summary.samples,
             "minutes": summary.minutes,
             "iterations": summary.iterations,
-            "clips": [clip.stem for clip in clips],
+            "clips": ["the tracked motion" if c == demo else c.stem for c in clips],
         }
 
     def evaluate(folder: Path) -> dict[str, Any]:

@@ -199,7 +199,7 @@ def body_plots(time: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> Plots:
 
 def _distance_plots(time: np.ndarray, scene: Any, qpos: np.ndarray) -> list[Plot]:
     """Distance along the run from the root to the scene's bar and marks (line, goal)."""
-    marks = {name: np.asarray(pos) for name, pos in scene.sites.items()}
+    marks = {name: np.asarray(pos) for name, pos in scene.sites.items() if name != "start"}
     for o in scene.free_objects:
         marks.setdefault(o.name, np.asarray(o.pos))
     lines = [

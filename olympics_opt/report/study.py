@@ -109,18 +109,22 @@ def _summary(
 
 def _take_off(solution: Any, warm: dict[str, Any], root: Path) -> Section:
     from olympics_opt.solve import motion_replay, solution_plots
+    from sports.registry import get_task
     from warmstart.clip import Clip
 
+    units = get_task(solution.problem).metrics
     demo = root / "warm_start" / "demo.npz"
     clip = Clip.load(demo) if demo.is_file() else None
     replay = motion_replay(solution, clip)
     rows = [
-        [name.replace("_", " "), float(value)]
+        [name.replace("_", " "), float(value), units.get(name, "")]
         for name, value in warm["achieved"].items()
         if isinstance(value, (int, float))
     ]
     table = Table(
-        ["outcome in MuJoCo", "value"], rows, "By the rules of the sport, of the tracked motion."
+        ["outcome in MuJoCo", "value", "unit"],
+        rows,
+        "By the rules of the sport, of the tracked motion.",
     )
     return Section(
         "The optimised take-off",
