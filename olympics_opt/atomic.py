@@ -35,6 +35,16 @@ def write_json(path: str | Path, value: Any) -> Path:
     return write_text(path, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
 
 
+def prepare(path: str | Path) -> Path:
+    """Makes the folder of a file that will take long to earn. Raises ValueError for a folder in
+    its place, OSError where nothing can be written."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder, not a file to write")
+    return path
+
+
 def _plain(value: Any) -> Any:
     """Numpy and torch scalars and arrays, tuples and paths as plain JSON values."""
     if isinstance(value, dict):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import importlib
+import os
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -239,6 +240,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\nolympics-opt: stopped.", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # the reader (head, a pager) has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except USER_ERRORS as error:
         if debug:
             raise

@@ -75,6 +75,9 @@ def run_evaluate(config: Evaluate) -> int:
     """The command: prints the metrics and writes the result schema."""
     from olympics_opt.cli import chosen_options
 
+    athlete(config.policy, config.name)
+    if config.trials >= 1:  # else the evaluation says what is wrong
+        atomic.prepare(config.out)
     played = play(
         config.name,
         config.policy,

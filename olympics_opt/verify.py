@@ -174,9 +174,14 @@ def parity_rows(task: str, strength: str, limits: str) -> list[dict[str, Any]]:
 def run_verify(config: Verify) -> int:
     """The command: 0 when the result holds, 1 when it does not."""
     from olympics_opt.cli import chosen_options
+    from olympics_opt.play import athlete
     from olympics_opt.report.page import Page, write_page
     from olympics_opt.report.verification import verification_sections
 
+    if config.trials < 1:
+        raise ValueError(f"trials must be at least 1, not {config.trials}")
+    athlete(config.policy, config.name)
+    atomic.prepare(config.out / "report.json")
     report, recordings = verify(
         config.name,
         config.policy,

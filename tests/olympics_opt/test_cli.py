@@ -77,6 +77,7 @@ def test_options_of_a_task_reach_its_config():
         ("evaluate high_jump --policy zero --out x.json --task.bar-height 99", "bar_height"),
         ("evaluate high_jump --policy nowhere --out x.json", "no policy 'nowhere'"),
         ("evaluate high_jump --policy zero --out x.json --trials 0", "trials"),
+        ("verify high_jump --policy zero --trials 0 --out x", "trials"),
         ("verify high_jump --policy pretrained:xyz --out x", "pretrained policy 'xyz'"),
         ("solve pole_vault --out x", "unknown problem 'pole_vault'"),
         ("solve high_jump --out x --problem.bar 1", "--problem.bar-height"),
@@ -160,6 +161,17 @@ def test_evaluate_survives_no_place_to_write(tmp_path: Path, capsys):
     out = tmp_path / "file" / "result.json"
     line = f"evaluate high_jump --policy zero --trials 1 --out {out}"
     assert "file" in sentence_of(capsys, *line.split())
+
+
+def test_a_reader_that_has_seen_enough_is_no_mistake():
+    done = subprocess.run(
+        f"{sys.executable} -m olympics_opt list --json | head -c 10",
+        shell=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.stdout.startswith("{") and done.stderr == ""
 
 
 def test_render_wants_something_to_write(capsys):
