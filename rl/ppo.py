@@ -323,7 +323,9 @@ class PPO:
             stats = torch.stack((kl, clipped, policy_loss, value_loss, bounds_loss))
             if self.world_size > 1:
                 self._average_over_ranks(stats)
-            self.learning_rate.copy_(adapted_rate(self.learning_rate, stats[0], c))
+            adapted = adapted_rate(self.learning_rate, stats[0], c)
+            # A resting actor diverges from nothing: its rate must not climb meanwhile.
+            self.learning_rate.copy_(torch.lerp(self.learning_rate, adapted, self.actor_weight))
             self._stats += stats
         nn.utils.clip_grad_norm_(self.actor.parameters(), c.grad_norm, foreach=True)
         nn.utils.clip_grad_norm_(self.critic.parameters(), c.grad_norm, foreach=True)

@@ -40,6 +40,7 @@ from rl.ppo import PAPER, PPO, STATISTICS, PPOConfig
 from rl.rollout import collect
 from rl.runlog import Row, RunLog
 from sports.env import Env, Starts, make_env
+from sports.physics.variation import Variation
 
 DEFAULT_WORLDS = {"mujoco": 256, "warp": 8192, "drake": 4}
 DEFAULT_SAMPLES = 100_000_000
@@ -78,6 +79,10 @@ class TrainConfig:
     """Options of the engine."""
     timestep_divisor: int = 1
     """2 halves the physics time step at the same control rate."""
+    vary: bool = False
+    """Let the worlds differ in friction, gains and contact softness and, with
+    ``timestep_divisor`` 2, half of them run at the full time step: a policy that must hold in
+    every engine needs it."""
     init: str | None = None
     """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]."""
     clips: tuple[Path, ...] = ()
@@ -156,6 +161,9 @@ MakeEnv = Callable[[TrainConfig, int], Any]
 
 def default_env(config: TrainConfig, seed: int) -> Env:
     """The config's task on its engine, in training mode."""
+    physics_options = dict(config.physics_options)
+    if config.vary:
+        physics_options |= {"variation": Variation(), "variation_seed": seed}
     return make_env(
         config.task,
         engine=config.engine,
@@ -165,7 +173,7 @@ def default_env(config: TrainConfig, seed: int) -> Env:
         limits=config.limits,
         training=True,
         options=config.options,
-        physics_options=config.physics_options,
+        physics_options=physics_options,
         timestep_divisor=config.timestep_divisor,
     )
 

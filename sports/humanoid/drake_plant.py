@@ -65,11 +65,13 @@ POINT_RADIUS = 1e-4
 FRICTION = 1.0
 """Coulomb coefficient of every geometry (sports.md, Common). Drake combines two coefficients as
 2 a b / (a + b), which is 1 for two surfaces of 1."""
-STIFFNESS = 2e5
+STIFFNESS = 1e5
 """Point contact stiffness (N/m) of athletes, ground and fixtures: a standing athlete sinks in by
-about 0.5 mm on 16 sole corners, as little as in MuJoCo."""
-DISSIPATION = 10.0
-"""Hunt-Crossley dissipation (s/m): no visible rebound, like MuJoCo's critically damped contact."""
+about 1 mm on 16 sole corners."""
+DISSIPATION = 1.0
+"""Hunt-Crossley dissipation (s/m). Landings at 1-4 m/s follow MuJoCo at 1/960 s best with it
+(mean root distance over 0.5 s 1.3 cm; 3.1 cm at 0.05 s/m; MuJoCo at 1/120 s 4.6 cm); at 10 s/m
+the force of an impact is 1.7 times MuJoCo's."""
 
 _UNIT = np.eye(3)
 

@@ -14,8 +14,9 @@ def make_physics(engine: str, scene: Scene, num_worlds: int, **options: object) 
     """A batch of ``num_worlds`` worlds of ``scene`` on an engine.
 
     Options: ``mujoco`` takes ``threads``; ``warp`` takes ``device``; ``drake`` takes
-    ``timestep``. Raises ValueError for an unknown engine or world count, RuntimeError when
-    the engine cannot run here (its package or its GPU is missing).
+    ``timestep``; ``mujoco`` and ``warp`` take ``variation`` and ``variation_seed``. Raises
+    ValueError for an unknown engine or world count, RuntimeError when the engine cannot run here
+    (its package or its GPU is missing).
     """
     if num_worlds < 1:
         raise ValueError(f"the number of worlds must be at least 1, not {num_worlds}")

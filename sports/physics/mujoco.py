@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sports.humanoid.mjcf import body_name, build_model
 from sports.physics.base import Geometry, PhysicsState, default_state, diverged
+from sports.physics.variation import Draw, Variation, draw
 from sports.scene import Scene
 
 _VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -24,7 +25,15 @@ class MujocoPhysics:
 
     engine = "mujoco"
 
-    def __init__(self, scene: Scene, num_worlds: int, threads: int = 0) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        num_worlds: int,
+        threads: int = 0,
+        variation: Variation | None = None,
+        variation_seed: int = 0,
+    ) -> None:
+        """``threads``: 0 for all cores. ``variation``: let the worlds differ."""
         self.scene = scene
         self.num_worlds = n = num_worlds
         self.device = torch.device("cpu")
@@ -61,14 +70,35 @@ class MujocoPhysics:
         self.nan_worlds = 0
         self.overflow = 0
         self._forces = np.zeros((n, model.nsensordata // 3, 3))
+        self._timesteps: list[np.ndarray] | None = None
+        if variation is not None:
+            self._vary(draw(variation, n, scene.substeps, variation_seed))
         self.batch.reset(stage=_VEL)
         self._read()
+
+    def _vary(self, drawn: Draw) -> None:
+        """Gives each world its own numbers; see the ``warp`` engine."""
+        expand = self.batch.expand
+        expand("geom_friction")[:, :, 0] *= drawn.friction[:, None]
+        expand("geom_solref")[:, :, 0] = drawn.contact_time[:, None]
+        expand("actuator_gainprm")[:, :, 0] *= drawn.stiffness[:, None]
+        expand("actuator_biasprm")[:, :, 1] *= drawn.stiffness[:, None]
+        damping = expand("dof_damping")
+        damping *= drawn.damping.reshape(-1, *[1] * (damping.ndim - 1))
+        if drawn.coarse.any():
+            h = self.scene.timestep
+            self._timestep = expand("opt.timestep")
+            double = np.where(drawn.coarse, 2 * h, h)
+            none = np.where(drawn.coarse, 0.0, h)
+            self._timesteps = [none if i % 2 else double for i in range(self.scene.substeps)]
 
     def step(self, ctrl: Tensor) -> None:
         self._ctrl[:] = ctrl.numpy()
         forces, largest = None, None
         for i in range(self.scene.substeps):
             last = i == self.scene.substeps - 1
+            if self._timesteps is not None:
+                self._timestep[:] = self._timesteps[i].reshape(self._timestep.shape)
             self.batch.step(stage=_VEL if last else 0)
             now = self._sensors.reshape(self.num_worlds, -1, 3)
             norm = np.einsum("nsi,nsi->ns", now, now)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from sports.humanoid.mjcf import GROUND, body_name, build_model
 from sports.physics.base import Geometry, PhysicsState, diverged
+from sports.physics.variation import Draw, Variation, draw
 from sports.scene import Scene
 
 ITERATIONS, LINE_SEARCH = 5, 8
@@ -121,9 +122,11 @@ class WarpPhysics:
         device: str | None = None,
         iterations: int = ITERATIONS,
         line_search: int = LINE_SEARCH,
+        variation: Variation | None = None,
+        variation_seed: int = 0,
     ) -> None:
-        """``device``: a torch device; None takes the current GPU. Raises RuntimeError when there
-        is no GPU and ``device`` does not say ``cpu``."""
+        """``device``: a torch device; None takes the current GPU. ``variation``: let the worlds
+        differ. Raises RuntimeError when there is no GPU and ``device`` does not say ``cpu``."""
         if device is None:
             if not torch.cuda.is_available():
                 raise RuntimeError(
@@ -155,6 +158,9 @@ class WarpPhysics:
             self.m = mjw.put_model(model)
             self.m.opt.warn_overflow = 0  # counted below, never printed
             self.d = mjw.make_data(model, nworld=n, nconmax=contacts, njmax=rows)
+            self._timesteps = [self.m.opt.timestep] * scene.substeps
+            if variation is not None:
+                self._vary(draw(variation, n, scene.substeps, variation_seed))
         view = wp.to_torch
         d = self.d
         self.qpos, self.qvel = view(d.qpos), view(d.qvel)
@@ -240,9 +246,37 @@ class WarpPhysics:
     def close(self) -> None:
         self._step_graph = self._refresh_graph = None
 
+    def _vary(self, drawn: Draw) -> None:
+        """Gives each world its own numbers. A coarse world takes two time steps at once, then
+        one of length zero, which changes nothing."""
+        model, m, n = self.model, self.m, self.num_worlds
+
+        def rows(values: np.ndarray) -> np.ndarray:
+            return np.repeat(values[None], n, axis=0).astype(np.float32)
+
+        friction = rows(model.geom_friction)
+        friction[:, :, 0] *= drawn.friction[:, None]
+        m.geom_friction = wp.array(friction, dtype=wp.vec3)
+        solref = rows(model.geom_solref)
+        solref[:, :, 0] = drawn.contact_time[:, None]
+        m.geom_solref = wp.array(solref, dtype=wp.vec2)
+        gain, bias = rows(model.actuator_gainprm), rows(model.actuator_biasprm)
+        gain[:, :, 0] *= drawn.stiffness[:, None]
+        bias[:, :, 1] *= drawn.stiffness[:, None]
+        m.actuator_gainprm = wp.array(gain, dtype=m.actuator_gainprm.dtype)
+        m.actuator_biasprm = wp.array(bias, dtype=m.actuator_biasprm.dtype)
+        damping = rows(model.dof_damping.reshape(model.nv, -1)[:, 0])
+        m.dof_damping = wp.array(damping * drawn.damping[:, None].astype(np.float32), dtype=float)
+        if drawn.coarse.any():
+            h = self.scene.timestep
+            double = wp.array(np.where(drawn.coarse, 2 * h, h).astype(np.float32), dtype=float)
+            none = wp.array(np.where(drawn.coarse, 0.0, h).astype(np.float32), dtype=float)
+            self._timesteps = [none if i % 2 else double for i in range(self.scene.substeps)]
+
     def _substeps(self) -> None:
         d = self.d
         for i in range(self.scene.substeps):
+            self.m.opt.timestep = self._timesteps[i]
             mjw.step(self.m, d)
             mjw.contact_force(self.m, d, self._contact_ids, True, self._contact_force)
             wp.launch(
