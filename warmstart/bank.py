@@ -35,8 +35,10 @@ class Window:
     """From this time after the clip's first frame."""
     end: float | None = None
     """Until this time; None for the end."""
-    before: str | None = None
-    """Until an event of the clip's metadata, e.g. ``takeoff``; clips without it keep all."""
+    before: str | None = "landing"
+    """Until an event of the clip's metadata: ``takeoff`` keeps the approach, ``landing`` the
+    flight too; None, and a clip without the event, keep all. After the landing a demonstration
+    only falls: nothing to learn from, and for a task an outcome that somebody else earned."""
 
     def __post_init__(self) -> None:
         if self.start < 0 or (self.end is not None and self.end < self.start):
@@ -76,13 +78,13 @@ class ClipBank:
         window: Window | None = None,
         probability: float = 0.5,
         context: Iterable[str] = (),
-        floor: float = 0.01,
+        floor: float = 0.02,
     ) -> Starts:
         """Frames of all clips as start states, each with the labels of its clip.
 
         ``context`` names labels besides those of the clips' tasks; a clip without one has NaN
         there, which a task reads as "draw your own". Frames that reach more than ``floor`` (m)
-        below the ground are left out. Raises ValueError when no frame is left or a label is not
+        below the ground are left out; a loaded foot sinks up to 1 cm at a take-off. Raises ValueError when no frame is left or a label is not
         a number.
         """
         window = window or Window()

@@ -1,16 +1,20 @@
 """From a solution to a demonstration: certified, tracked in MuJoCo, labelled with what it achieved.
 
-This is what ``solve`` runs after the optimiser and what made the shipped clips.
+This is what made the shipped clips: ``python -m warmstart.demonstration SOLUTION.npz... --out DIR``
+writes, for each solution that passes, ``PROBLEM_ASKED_STRENGTH.npz`` and its certificate beside it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import argparse
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from warmstart.certificate import Certificate, certify
 from warmstart.clip import Clip
+from warmstart.outcome import OUTCOMES
 from warmstart.solution import Solution
 from warmstart.tracking import Tracking, track_best
 
@@ -71,3 +75,35 @@ def save_demonstration(found: Demonstration, clip_path: Path, certificate_path: 
     found.certificate.to_json(certificate_path)
     if found.clip is not None:
         found.clip.save(clip_path)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Makes demonstrations of solution files; 1 when one of them failed, 2 for a bad file."""
+    parser = argparse.ArgumentParser(prog="python -m warmstart.demonstration", description=__doc__)
+    parser.add_argument("solutions", nargs="+", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--attempts", type=int, default=5)
+    options = parser.parse_args(arguments)
+    failed = 0
+    for path in options.solutions:
+        try:
+            solution = Solution.load(path)
+            found = demonstrate(solution, attempts=options.attempts)
+            asked = solution.asked[OUTCOMES[solution.problem].field]
+        except (ValueError, KeyError) as error:
+            print(f"{path}: {error}", file=sys.stderr)
+            return 2
+        name = f"{solution.problem}_{asked:g}m_{solution.strength}"
+        if found.passed:
+            out = options.out
+            save_demonstration(found, out / f"{name}.npz", out / f"{name}.json")
+            assert found.clip is not None
+            print(f"{name}: {found.clip.meta['achieved']}")
+        else:
+            failed += 1
+            print(f"{name}: no demonstration: {found.reason}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -148,6 +148,18 @@ def _flight(body: Body, times: np.ndarray, qpos: np.ndarray) -> tuple[int, int] 
     return max(runs, key=lambda r: times[min(r[1], len(times) - 1)] - times[r[0]], default=None)
 
 
+def flight_events(body: Body, times: np.ndarray, qpos: np.ndarray) -> dict[str, float]:
+    """``takeoff``: the last frame on the ground before the longest flight, and ``landing``: the
+    first one after it (s); empty without a flight, no landing when it ends in the air."""
+    flight = _flight(body, times, qpos)
+    if flight is None:
+        return {}
+    events = {"takeoff": float(times[max(flight[0] - 1, 0)])}
+    if flight[1] < len(times):
+        events["landing"] = float(times[flight[1]])
+    return events
+
+
 def jump_length(body: Body, times: np.ndarray, qpos: np.ndarray) -> float:
     """Smallest x (m) of a ground contact within 0.3 s of the landing, minus the line at 20.
 

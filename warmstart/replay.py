@@ -131,4 +131,4 @@ def play(
         ctrl=np.array(ctrl),
         meta=dict(clip.meta),
     )
-    return out, {k: m for k, m in metrics.items() if np.isfinite(m)}
+    return out, {k: round(m, 6) for k, m in metrics.items() if np.isfinite(m)}

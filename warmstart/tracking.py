@@ -25,6 +25,7 @@ from sports.humanoid.mjcf import build_spec
 from sports.registry import task_names
 from sports.scene import Scene
 from warmstart.clip import Clip, clip_from_solution
+from warmstart.outcome import flight_events
 from warmstart.replay import play, scene_of, scene_options
 from warmstart.solution import Solution
 from warmstart.tracking_cost import JumpRules, Reference, Weights, jump_rules
@@ -167,6 +168,7 @@ def track(
     if clip.meta.get("problem") in task_names():
         tracked, outcome = play(tracked, clip.meta["problem"], scene_options(clip), scene.body)
         tracked.meta["achieved"] = outcome
+        tracked.meta["events"] = flight_events(scene.body, tracked.times, tracked.qpos)
     links, *_ = worlds.kinematics(tracked.qpos[: steps + 1], tracked.qvel[: steps + 1])
     root = np.linalg.norm(tracked.qpos[: steps + 1, :3] - frames.qpos[: len(links), :3], axis=1)
     error = np.linalg.norm(links - frames.link_pos[: len(links)], axis=2)

@@ -55,12 +55,19 @@ def test_frames_of_the_window_with_the_labels_of_their_clip():
 
 
 def test_frames_below_the_ground_are_left_out():
-    starts = ClipBank([clip(sink=0.02)]).starts()
+    starts = ClipBank([clip(sink=0.03)]).starts()
     assert len(starts.qpos) == 30 and float(starts.qpos[:, 1].min()) > 0
-    assert len(ClipBank([clip(sink=0.005)]).starts().qpos) == 31
-    assert len(ClipBank([clip(sink=0.02)]).starts(floor=0.03).qpos) == 31
+    assert len(ClipBank([clip(sink=0.01)]).starts().qpos) == 31
+    assert len(ClipBank([clip(sink=0.03)]).starts(floor=0.04).qpos) == 31
     with pytest.raises(ValueError, match="no frame of 1 clips"):
-        ClipBank([clip(sink=0.02)]).starts(Window(end=0.0))
+        ClipBank([clip(sink=0.03)]).starts(Window(end=0.0))
+
+
+def test_by_default_nothing_after_the_landing_serves_as_a_start():
+    bank = ClipBank([clip(events={"takeoff": 0.2, "landing": 0.5})])
+    assert len(bank.starts().qpos) == 16
+    assert len(bank.starts(Window(before="takeoff")).qpos) == 7
+    assert len(bank.starts(Window(before=None)).qpos) == 31
 
 
 def test_what_makes_no_bank_is_refused():

@@ -23,7 +23,14 @@ from warmstart.clip import Clip
 from warmstart.contact import sole_points
 from warmstart.demonstration import demonstrate, save_demonstration
 from warmstart.inverse_dynamics import inverse_dynamics_drake, inverse_dynamics_mujoco
-from warmstart.outcome import cleared_height, jump_length, link_poses, lowest, support
+from warmstart.outcome import (
+    cleared_height,
+    flight_events,
+    jump_length,
+    link_poses,
+    lowest,
+    support,
+)
 from warmstart.replay import play
 from warmstart.solution import Solution
 from warmstart.tracking import Tracking
@@ -292,6 +299,10 @@ def test_jump_length_of_a_stiff_jumper():
     # The mark: the heels in the first frame within 5 mm of the ground, at about t = 0.9 s.
     length = jump_length(BODY, t, qpos)
     assert length == pytest.approx(17.0 + 5.0 * 0.9 + soles.min() - 20.0, abs=0.03)
+    events = flight_events(BODY, t, qpos)
+    assert events["takeoff"] == pytest.approx(0.4, abs=0.01)
+    assert events["landing"] == pytest.approx(0.9, abs=0.01)
+    assert flight_events(BODY, t, translated(x, 0 * z)) == {}
     assert np.isnan(jump_length(BODY, t, qpos + np.eye(7 + N)[0] * 1.2))  # a foot over the line
     assert np.isnan(jump_length(BODY, t[:200], qpos[:200]))  # it never lands
     assert np.isnan(jump_length(BODY, t, translated(x, 0 * z)))  # it never flies
