@@ -84,8 +84,8 @@ class ClipBank:
 
         ``context`` names labels besides those of the clips' tasks; a clip without one has NaN
         there, which a task reads as "draw your own". Frames that reach more than ``floor`` (m)
-        below the ground are left out; a loaded foot sinks up to 1 cm at a take-off. Raises ValueError when no frame is left or a label is not
-        a number.
+        below the ground are left out; a loaded foot sinks up to 1 cm at a take-off. Raises
+        ValueError when no frame is left or a label is not a number.
         """
         window = window or Window()
         body = load_body(self.body)
