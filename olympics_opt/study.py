@@ -44,11 +44,11 @@ START_PROBABILITY = (0.5, 0.1)
 """Share of training episodes that start from a state of the tracked motion: first, last."""
 FINE_TUNING: dict[str, Any] = {
     "minibatches": 2,
-    "epochs": 3,
+    "epochs": 2,
     "sigma": 0.06,
     "learning_rate": 2e-5,
     "learning_rate_limits": (1e-6, 1e-4),
-    "critic_warmup": 20,
+    "critic_warmup": 10,
 }
 """PPO for a few minutes from a policy that is good already: small steps, little noise, and a
 critic that first learns to judge it."""
