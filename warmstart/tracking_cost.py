@@ -33,8 +33,8 @@ class Weights:
     """Per (rad/s)^2."""
     effort: float = 0.05
     """Per squared share of the servo's range by which targets leave the reference's."""
-    bar: float = 400.0
-    """Per m by which the bar has moved."""
+    bar: float = 1000.0
+    """Per m by which the bar has moved, and per 10 m/s at which it moves."""
     foul: float = 400.0
     """Per m by which a contact before the take-off lies beyond the line."""
     mark: float = 100.0
@@ -73,9 +73,6 @@ class JumpRules:
     """x at which the jump is to be measured (m)."""
     body: Body
     weights: Weights
-
-    AFTER = long_jump.MARK_STEPS + 3
-    """Frames that are planned beyond the reference, in which marks count."""
 
     @cached_property
     def _points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
