@@ -266,6 +266,8 @@ def run(
 
 VIOLATION = 1e-5
 """A program counts as solved below this violation of its scaled rows."""
+NEARLY = 1e-3
+"""An elastic program below this violation tells which torque limits are short."""
 
 
 def check(result: Result, what: str, elastic: Callable[[], tuple[Transcription, Result]]) -> None:
@@ -273,13 +275,14 @@ def check(result: Result, what: str, elastic: Callable[[], tuple[Transcription, 
     if result.max_violation < VIOLATION and (result.success or "Acceptable" in result.status):
         return
     program, relaxed = elastic()
-    if relaxed.max_violation < VIOLATION:
+    strength = program.body.strength
+    if relaxed.max_violation < NEARLY:
         stretched = program.stretched(relaxed.x)
         if stretched:
             needs = ", ".join(f"{dof} {100 * share:.0f} %" for dof, share in stretched[:4])
             raise Infeasible(
-                f"{what} is infeasible at strength '{program.body.strength}': it needs {needs} "
-                "of their torque limits; ask for less or use strength 'paper'"
+                f"{what} is infeasible at strength '{strength}': the solver found no motion "
+                f"within the torque limits, and one with {needs} of them; ask for less"
             )
         raise Infeasible(
             f"{what}: the solver stopped with '{result.status}' although a motion within the "
@@ -287,8 +290,8 @@ def check(result: Result, what: str, elastic: Callable[[], tuple[Transcription, 
         )
     worst = relaxed.worst[0][0] if relaxed.worst else "no single row"
     raise Infeasible(
-        f"{what} is infeasible even with {ELASTIC_REACH:.0f} times the torque: "
-        f"'{worst}' cannot be met (solver: {relaxed.status})"
+        f"{what}: no motion found at strength '{strength}', nor with {ELASTIC_REACH:.0f} times "
+        f"its torque: '{worst}' is not met (solver: {relaxed.status})"
     )
 
 

@@ -64,9 +64,11 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     body = load_body("smpl", strength=config.strength)
     model = jumper.make_model(body)
     knots = jumper.scaled(config.detail)
+    beyond = max(config.length - 5.0, 0.0)
+    shortest = max(0.12 - 0.015 * beyond, 0.085)  # a faster run leaves less time on the foot
     phases = [
-        Phase("flat", knots(16), (0.075, 0.25), {"L": "flat"}, grading=2.0),
-        Phase("toe", knots(9), (0.045, 0.12), {"L": "toe"}),
+        Phase("flat", knots(16), (0.625 * shortest, 0.25), {"L": "flat"}, grading=2.0),
+        Phase("toe", knots(9), (0.375 * shortest, 0.12), {"L": "toe"}),
         Phase("flight", knots(60), (0.25, 1.20), grading=3.0),
     ]
     position = jumper.boxes(jumper.POSITION) | {
@@ -86,7 +88,9 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
         elastic=elastic,
     )
     keep_apart(program, body, np.arange(program.K))
-    jumper.start_rows(program, config.approach_speed, sink=(-0.8, -0.1), limb_rate=12.0)
+    jumper.start_rows(
+        program, config.approach_speed, sink=(-0.8, -0.1), limb_rate=12.0 + 2.0 * beyond
+    )
     left, right = jumper.foot(body, "L"), jumper.foot(body, "R")
     corners = [b for b in outline(body) if b.link in ("L_Ankle", "L_Toe")]
 
