@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sports.humanoid.mjcf import body_name, build_model
 from sports.physics.base import Geometry, PhysicsState, default_state, diverged
+from sports.physics.momentum import MomentumKeeper, Tree
 from sports.physics.variation import Draw, Variation, draw
 from sports.scene import Scene
 
@@ -46,6 +47,7 @@ class MujocoPhysics:
         self._xpos, self._xquat, self._cvel = bind("xpos"), bind("xquat"), bind("cvel")
         self._com, self._sensors = bind("subtree_com"), bind("sensordata")
         self._warmstart = bind("qacc_warmstart")
+        self._cinert, self._constraint = bind("cinert"), bind("qfrc_constraint")
 
         agents, links = scene.num_agents, scene.body.num_links
         self._ids = np.array(
@@ -70,6 +72,10 @@ class MujocoPhysics:
         self.nan_worlds = 0
         self.overflow = 0
         self._forces = np.zeros((n, model.nsensordata // 3, 3))
+        self._keepers = [
+            MomentumKeeper(n, scene.body.mass, scene.timestep) for _ in range(agents)
+        ]
+        self._twist, self._shift = np.zeros((n, agents, 6)), np.zeros((n, agents, 3))
         self._timesteps: list[np.ndarray] | None = None
         if variation is not None:
             self._vary(draw(variation, n, scene.substeps, variation_seed))
@@ -100,6 +106,7 @@ class MujocoPhysics:
             if self._timesteps is not None:
                 self._timestep[:] = self._timesteps[i].reshape(self._timestep.shape)
             self.batch.step(stage=_VEL if last else 0)
+            self._keep_momentum(i, last)
             now = self._sensors.reshape(self.num_worlds, -1, 3)
             norm = np.einsum("nsi,nsi->ns", now, now)
             if forces is None:
@@ -118,6 +125,28 @@ class MujocoPhysics:
             safe.mocap_pos = self.mocap_pos
             self.reset(self.bad, safe)
 
+    def _keep_momentum(self, substep: int, last: bool) -> None:
+        """Undoes the integrator's drift of every athlete's momentum; see ``momentum.py``."""
+        for agent, keeper in enumerate(self._keepers):
+            if self._timesteps is not None:
+                keeper.timestep = self._timesteps[substep]
+            links, root = self._ids[agent], self._ids[agent, 0]
+            v, q = self.scene.agent_qvel(agent).start, self.scene.agent_qpos(agent).start
+            tree = Tree(
+                cinert=self._cinert[:, links[0] : links[-1] + 1],
+                cvel=self._cvel[:, links[0] : links[-1] + 1],
+                com=self._com[:, root],
+                root_pos=self._xpos[:, root],
+                root_quat=self._xquat[:, root],
+                root_force=self._constraint[:, v : v + 6],
+            )
+            twist, change, shift = keeper.correct(tree, current=last)
+            self._qvel[:, v : v + 6] += change
+            self._qpos[:, q : q + 3] += shift
+            if last:
+                self._twist[:, agent] = twist
+                self._shift[:, agent] = shift
+
     def reset(self, mask: Tensor, state: PhysicsState) -> None:
         ids = np.flatnonzero(mask.numpy())
         if ids.size == 0:
@@ -130,6 +159,9 @@ class MujocoPhysics:
             for k, row in enumerate(self._mocap_rows):
                 self._mocap[ids, row] = mocap[:, k]
         self.batch.forward(ids=ids, stage=_VEL)
+        for keeper in self._keepers:
+            keeper.forget(ids)
+        self._twist[ids], self._shift[ids] = 0.0, 0.0
         self._forces[ids] = 0.0
         self._read()
 
@@ -143,12 +175,16 @@ class MujocoPhysics:
             "qpos": torch.from_numpy(self._qpos.copy()),
             "qvel": torch.from_numpy(self._qvel.copy()),
             "qacc_warmstart": torch.from_numpy(self._warmstart.copy()),
+            "target": torch.from_numpy(np.stack([k.target for k in self._keepers])),
+            "path": torch.from_numpy(np.stack([k.path for k in self._keepers])),
         }
 
     def load_extra_state(self, state: dict[str, Tensor]) -> None:
         """Restores :meth:`extra_state`; call after ``reset``."""
         self._qpos[:], self._qvel[:] = state["qpos"].numpy(), state["qvel"].numpy()
         self._warmstart[:] = state["qacc_warmstart"].numpy()
+        for i, keeper in enumerate(self._keepers):
+            keeper.target, keeper.path = state["target"][i].numpy(), state["path"][i].numpy()
         self.batch.forward(stage=_VEL)
         self._read()
 
@@ -162,17 +198,22 @@ class MujocoPhysics:
         self.qvel = torch.from_numpy(self._qvel.astype(np.float32))
         if self._mocap is not None:
             self.mocap_pos = torch.from_numpy(self._mocap[:, self._mocap_rows].astype(np.float32))
+        k = agents * links
         position = self._xpos[:, self._rows]
         spin = self._cvel[:, self._rows, :3]
+        linear = self._cvel[:, self._rows, 3:]
         # cvel is taken at the centre of mass of the kinematic tree; move it to the link origin.
-        velocity = self._cvel[:, self._rows, 3:] + np.cross(
-            spin, position - self._com[:, self._roots]
-        )
+        velocity = linear + np.cross(spin, position - self._com[:, self._roots])
+        # The last substep's correction came after the engine had computed these.
+        spin[:, :k] += np.repeat(self._twist[:, :, :3], links, axis=1)
+        arm = position[:, :k] - self._com[:, self._roots[:k]]
+        turn = np.repeat(self._twist[:, :, :3], links, axis=1)
+        velocity[:, :k] += np.repeat(self._twist[:, :, 3:], links, axis=1) + np.cross(turn, arm)
+        position[:, :k] += np.repeat(self._shift, links, axis=1)
         pos = torch.from_numpy(position.astype(np.float32))
         quat = torch.from_numpy(self._xquat[:, self._rows].astype(np.float32))
         lin = torch.from_numpy(velocity.astype(np.float32))
         ang = torch.from_numpy(spin.astype(np.float32))
-        k = agents * links
         self.body_pos, self.object_pos = pos[:, :k].view(n, agents, links, 3), pos[:, k:]
         self.body_quat, self.object_quat = quat[:, :k].view(n, agents, links, 4), quat[:, k:]
         self.body_linvel, self.object_linvel = lin[:, :k].view(n, agents, links, 3), lin[:, k:]
