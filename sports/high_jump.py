@@ -103,11 +103,12 @@ def curriculum(config: HighJump, num_worlds: int, device: torch.device) -> Memor
 
 
 def promote(view: View, memory: Memory, step: Advance, ended: Tensor) -> Memory:
-    """One level up for a world that cleared the bar of its level."""
+    """One level up for a world that cleared the bar of its level from the standing start: a
+    demonstration's flight is no proof that the world can get there by itself."""
     level = view.curriculum["level"]
     heights = constant(HEIGHTS, level.device)
     at_level = memory["bar_height"] >= heights[level] - 1e-4
-    up = ended & step.success & at_level
+    up = ended & step.success & at_level & memory["standing"]
     return {"level": (level + up.long()).clamp(max=len(HEIGHTS) - 1)}
 
 
@@ -138,13 +139,15 @@ def start(
     """Sets the bar: the drawn height, or that of the demonstration a world starts from."""
     n = state.qpos.shape[0]
     height = _heights(view, n, generator, training)
+    standing = torch.ones(n, dtype=torch.bool, device=height.device)
     if "bar_height" in context:
         label = context["bar_height"]
-        height = torch.where(torch.isnan(label), height, label)
+        standing = torch.isnan(label)
+        height = torch.where(standing, height, label)
     bar = view.physics.scene.object_qpos("bar")
     state.qpos[:, bar.start + 2] = height - BAR_RADIUS
     state.mocap_pos[:, :, 2] = (height - BAR_RADIUS - _PEG_Z)[:, None]
-    return state, {"bar_height": height}
+    return state, {"bar_height": height, "standing": standing}
 
 
 def begin(view: View, context: Memory) -> Memory:
@@ -153,6 +156,7 @@ def begin(view: View, context: Memory) -> Memory:
     zero = torch.zeros_like(root[:, 0])
     return {
         "bar_height": context["bar_height"],
+        "standing": context["standing"],
         "bar_rest": view.physics.object_pos[:, 0].clone(),
         "root": root.clone(),
         "x_max": root[:, 0].clone(),

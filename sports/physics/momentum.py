@@ -23,8 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 
 GRAVITY = np.array((0.0, 0.0, -9.81))
-NO_FORCE = 1e-6
-"""A root force (N, N m) below this is rounding: the athlete touches nothing."""
+NO_FORCE = 0.1
+"""A root force (N, N m) below this is rounding of self-contacts: the athlete touches nothing."""
 
 
 def spatial_momentum(cinert: np.ndarray, cvel: np.ndarray) -> np.ndarray:

@@ -72,9 +72,7 @@ class MujocoPhysics:
         self.nan_worlds = 0
         self.overflow = 0
         self._forces = np.zeros((n, model.nsensordata // 3, 3))
-        self._keepers = [
-            MomentumKeeper(n, scene.body.mass, scene.timestep) for _ in range(agents)
-        ]
+        self._keepers = [MomentumKeeper(n, scene.body.mass, scene.timestep) for _ in range(agents)]
         self._twist, self._shift = np.zeros((n, agents, 6)), np.zeros((n, agents, 3))
         self._timesteps: list[np.ndarray] | None = None
         if variation is not None:

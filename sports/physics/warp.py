@@ -17,6 +17,7 @@ from torch import Tensor
 
 from sports.humanoid.mjcf import GROUND, body_name, build_model
 from sports.physics.base import Geometry, PhysicsState, diverged
+from sports.physics.momentum import GRAVITY, NO_FORCE
 from sports.physics.variation import Draw, Variation, draw
 from sports.scene import Scene
 
@@ -84,6 +85,99 @@ def _keep_largest(
         forces[world, s, 2] = z
     for k in range(3):
         now[world, s, k] = 0.0
+
+
+@wp.kernel
+def _keep_momentum(
+    cinert: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    qfrc_constraint: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    timestep: wp.array(dtype=float),  # type: ignore[valid-type]
+    tree: wp.array2d(dtype=int),  # type: ignore[valid-type]
+    links: int,
+    mass: float,
+    current: int,
+    cvel: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    com: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    xpos: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    xquat: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    known: wp.array2d(dtype=int),  # type: ignore[valid-type]
+    target: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    path: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
+):
+    """The correction of ``momentum.py`` for one athlete of one world; same formulas."""
+    w, a = wp.tid()
+    root, q, v = tree[a, 0], tree[a, 1], tree[a, 2]
+    h = timestep[w % timestep.shape[0]]
+    angular = wp.vec3(0.0, 0.0, 0.0)
+    linear = wp.vec3(0.0, 0.0, 0.0)
+    inertia = wp.mat33(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for k in range(links):
+        b = root + k
+        tensor = wp.mat33(
+            cinert[w, b, 0], cinert[w, b, 3], cinert[w, b, 4],
+            cinert[w, b, 3], cinert[w, b, 1], cinert[w, b, 5],
+            cinert[w, b, 4], cinert[w, b, 5], cinert[w, b, 2],
+        )  # fmt: skip
+        moment = wp.vec3(cinert[w, b, 6], cinert[w, b, 7], cinert[w, b, 8])
+        spin = wp.vec3(cvel[w, b, 0], cvel[w, b, 1], cvel[w, b, 2])
+        speed = wp.vec3(cvel[w, b, 3], cvel[w, b, 4], cvel[w, b, 5])
+        inertia += tensor
+        angular += tensor @ spin + wp.cross(moment, speed)
+        linear += cinert[w, b, 9] * speed - wp.cross(moment, spin)
+    center = wp.vec3(com[w, root, 0], com[w, root, 1], com[w, root, 2])
+    arm = wp.vec3(xpos[w, root, 0], xpos[w, root, 1], xpos[w, root, 2]) - center
+    turn = wp.quat_to_matrix(
+        wp.quat(xquat[w, root, 1], xquat[w, root, 2], xquat[w, root, 3], xquat[w, root, 0])
+    )
+    force = wp.vec3(qfrc_constraint[w, v], qfrc_constraint[w, v + 1], qfrc_constraint[w, v + 2])
+    local = wp.vec3(qfrc_constraint[w, v + 3], qfrc_constraint[w, v + 4], qfrc_constraint[w, v + 5])
+    flying = wp.length(force) + wp.length(local) < wp.static(NO_FORCE)
+    impulse_l = h * (turn @ local + wp.cross(arm, force))
+    impulse_p = h * (force + wp.vec3(0.0, 0.0, wp.static(float(GRAVITY[2])) * mass))
+
+    error_l = wp.vec3(0.0, 0.0, 0.0)
+    error_p = wp.vec3(0.0, 0.0, 0.0)
+    shift = wp.vec3(0.0, 0.0, 0.0)
+    if known[w, a] == 1:
+        error_l = wp.vec3(target[w, a, 0], target[w, a, 1], target[w, a, 2]) - angular
+        error_p = wp.vec3(target[w, a, 3], target[w, a, 4], target[w, a, 5]) - linear
+        if current == 1:
+            error_l += impulse_l
+            error_p += impulse_p
+        if flying:
+            shift = wp.vec3(path[w, a, 0], path[w, a, 1], path[w, a, 2]) - center
+            if current == 1:
+                shift += (h / mass) * (linear + error_p)
+    spin_change = wp.inverse(inertia) @ error_l
+    speed_change = error_p / mass
+    next_l = angular + error_l
+    next_p = linear + error_p
+    ahead = center + shift
+    if current == 0:
+        next_l += impulse_l
+        next_p += impulse_p
+        ahead += (h / mass) * next_p
+    root_change = speed_change + wp.cross(spin_change, arm)
+    local_change = wp.transpose(turn) @ spin_change
+    for i in range(3):
+        target[w, a, i] = next_l[i]
+        target[w, a, 3 + i] = next_p[i]
+        path[w, a, i] = ahead[i]
+        qpos[w, q + i] = qpos[w, q + i] + shift[i]
+        qvel[w, v + i] = qvel[w, v + i] + root_change[i]
+        qvel[w, v + 3 + i] = qvel[w, v + 3 + i] + local_change[i]
+    known[w, a] = 1
+    if current == 1:
+        # What a task reads was computed before this correction.
+        for i in range(3):
+            com[w, root, i] = com[w, root, i] + shift[i]
+        for k in range(links):
+            for i in range(3):
+                cvel[w, root + k, i] = cvel[w, root + k, i] + spin_change[i]
+                cvel[w, root + k, 3 + i] = cvel[w, root + k, 3 + i] + speed_change[i]
+                xpos[w, root + k, i] = xpos[w, root + k, i] + shift[i]
 
 
 def _contact_tables(
@@ -186,6 +280,18 @@ class WarpPhysics:
             self._contact_ids = wp.array(np.arange(self.d.naconmax), dtype=int)
             self._contact_force = wp.zeros(self.d.naconmax, dtype=wp.spatial_vector)
             self._now = wp.zeros((n, sensors, 3), dtype=float)
+            tree = [
+                (1 + a * links, scene.agent_qpos(a).start, scene.agent_qvel(a).start)
+                for a in range(agents)
+            ]
+            self._tree = wp.array(np.array(tree, dtype=np.int32), dtype=int)
+        # The athletes' momentum, kept by _keep_momentum.
+        self._known = torch.zeros(n, agents, dtype=torch.int32, device=self.device)
+        self._target = torch.zeros(n, agents, 6, device=self.device)
+        self._path = torch.zeros(n, agents, 3, device=self.device)
+        fields = (d.cvel, d.subtree_com, d.xpos, d.xquat)
+        self._kept = [wp.from_torch(view(d.cinert)), *(wp.from_torch(view(x)) for x in fields)]
+        self._kept += [wp.from_torch(x) for x in (self._known, self._target, self._path)]
         self._forces = torch.zeros(n, sensors, 3, device=self.device)
         self._largest = torch.zeros(n, sensors, device=self.device)
         self._wp_forces = wp.from_torch(self._forces)
@@ -203,6 +309,7 @@ class WarpPhysics:
         self.qpos.copy_(qpos0.expand_as(self.qpos))
         for t in (self.qvel, self._ctrl, self._warmstart, self._forces, self._overflow):
             t.zero_()
+        self._known.zero_()
         self._run(self._refresh_graph, self._refresh)
         self._derive()
 
@@ -229,6 +336,7 @@ class WarpPhysics:
         if self.mocap_pos.shape[1]:
             self.mocap_pos.copy_(torch.where(row[..., None], state.mocap_pos, self.mocap_pos))
         self._forces.masked_fill_(row[..., None], 0.0)
+        self._known.masked_fill_(row, 0)
         self._run(self._refresh_graph, self._refresh)
         self._derive()
 
@@ -236,12 +344,20 @@ class WarpPhysics:
         return self.geometry.extent(self.body_pos, self.body_quat, direction)
 
     def extra_state(self) -> dict[str, Tensor]:
-        """The solver's warm start."""
-        return {"qacc_warmstart": self._warmstart.clone()}
+        """The solver's warm start and the momentum expected."""
+        return {
+            "qacc_warmstart": self._warmstart.clone(),
+            "known": self._known.clone(),
+            "target": self._target.clone(),
+            "path": self._path.clone(),
+        }
 
     def load_extra_state(self, state: dict[str, Tensor]) -> None:
         """Restores :meth:`extra_state`; call after ``reset``."""
         self._warmstart.copy_(state["qacc_warmstart"])
+        self._known.copy_(state["known"])
+        self._target.copy_(state["target"])
+        self._path.copy_(state["path"])
 
     def close(self) -> None:
         self._step_graph = self._refresh_graph = None
@@ -300,7 +416,29 @@ class WarpPhysics:
                 inputs=[self._now, int(i == 0)],
                 outputs=[self._wp_forces, self._wp_largest],
             )
-        self._refresh()
+            last = i == self.scene.substeps - 1
+            if last:
+                self._refresh()
+            self._correct(self._timesteps[i], last)
+
+    def _correct(self, timestep: wp.array, last: bool) -> None:
+        cinert, *changed = self._kept
+        wp.launch(
+            _keep_momentum,
+            dim=(self.num_worlds, self.scene.num_agents),
+            inputs=[
+                cinert,
+                self.d.qfrc_constraint,
+                timestep,
+                self._tree,
+                self.scene.body.num_links,
+                self.scene.body.mass,
+                int(last),
+                *changed,
+                self.d.qpos,
+                self.d.qvel,
+            ],
+        )
 
     def _refresh(self) -> None:
         mjw.kinematics(self.m, self.d)

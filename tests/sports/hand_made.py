@@ -54,6 +54,7 @@ class HandMade:
         context = {}
         if hasattr(self.env.config, "bar_height"):
             context["bar_height"] = torch.full((self.env.num_worlds,), self.env.config.bar_height)
+            context["standing"] = torch.ones(self.env.num_worlds, dtype=torch.bool)
         self.env.memory = self.env.task.begin(self.env.view, context)
         self.env.view.clock = torch.full((self.env.num_worlds,), 5)
 

@@ -136,15 +136,16 @@ def test_the_field_ends():
 
 
 def test_worlds_are_promoted_only_by_clearing_their_own_level():
-    world = HandMade("high_jump", num_worlds=3, bar_height=1.0)
+    world = HandMade("high_jump", num_worlds=4, bar_height=1.0)
     env = world.env
     world.place((19.8, 6.0, HIGH))
     world.begin()
-    env.view.curriculum = {"level": torch.tensor([1, 2, 1])}
+    env.view.curriculum = {"level": torch.tensor([1, 2, 1, 1])}
+    env.memory["standing"][3] = False  # started in the flight of a demonstration
     step = world.advance()
-    step.success = torch.tensor([True, True, False])
-    levels = env.task.promote(env.view, env.memory, step, torch.tensor([True, True, True]))
-    assert levels["level"].tolist() == [2, 2, 1]
+    step.success = torch.tensor([True, True, False, True])
+    levels = env.task.promote(env.view, env.memory, step, torch.ones(4, dtype=torch.bool))
+    assert levels["level"].tolist() == [2, 2, 1, 1]
     assert HEIGHTS == (0.5, 1.0, 1.5, 2.0)
 
 
