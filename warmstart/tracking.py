@@ -21,7 +21,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from sports.humanoid.mjcf import build_spec
+from sports.humanoid.mjcf import body_name, build_spec
+from sports.physics.momentum import MomentumKeeper, Tree, spatial_momentum
 from sports.registry import task_names
 from sports.scene import Scene
 from warmstart.clip import Clip, clip_from_solution
@@ -82,41 +83,74 @@ class Tracked:
 
 
 class _Worlds:
-    """A batch that plays candidates from one state."""
+    """A batch that plays candidates from one state, by the physics of the ``mujoco`` engine.
+
+    Like the engine it keeps the athlete's momentum; unlike it, it simulates as many worlds as
+    are asked for, in double precision, and reads no forces.
+    """
 
     def __init__(self, scene: Scene, worlds: int, threads: int) -> None:
         spec = build_spec(scene)
         for sensor in list(spec.sensors):  # nobody reads forces here, and they cost time
             spec.delete(sensor)
-        root = f"agent0/{scene.body.links[0].name}"
-        for kind in ("COM", "LINVEL", "ANGMOM"):
-            spec.add_sensor(
-                name=kind,
-                type=getattr(mujoco.mjtSensor, f"mjSENS_SUBTREE{kind}"),
-                objtype=mujoco.mjtObj.mjOBJ_BODY,
-                objname=root,
-            )
         self.scene, self.model = scene, spec.compile()
         self.batch = Batch(self.model, nsim=worlds, nthread=threads)
         bind = self.batch.bind
         self.qpos, self.qvel, self.ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
         self.warm = bind("qacc_warmstart")
         self.xpos, self.xquat, self.xmat = bind("xpos"), bind("xquat"), bind("xmat")
-        self.whole = bind("sensordata")
-        self.links = np.array(
-            [self.model.body(f"agent0/{name}").id for name in scene.body.link_names]
-        )
+        self._cinert, self._cvel, self._com = bind("cinert"), bind("cvel"), bind("subtree_com")
+        self._constraint = bind("qfrc_constraint")
+        names = scene.body.link_names
+        self.links = np.array([self.model.body(body_name(0, name)).id for name in names])
+        self._tree = slice(self.links[0], self.links[-1] + 1)
 
     def put(self, count: int, qpos: np.ndarray, qvel: np.ndarray, warm: np.ndarray) -> None:
         """Puts the first ``count`` worlds into one state."""
         self.ids = np.arange(count)
+        self.keeper = MomentumKeeper(count, self.scene.body.mass, self.scene.timestep)
         self.qpos[:count], self.qvel[:count], self.warm[:count] = qpos, qvel, warm
         self.batch.forward(ids=self.ids, stage=_VEL)
 
     def step(self, ctrl: np.ndarray) -> None:
         """One control step of the worlds that were put."""
         self.ctrl[self.ids] = ctrl
-        self.batch.step(ids=self.ids, nstep=self.scene.substeps, stage=_VEL)
+        for substep in range(self.scene.substeps):
+            last = substep == self.scene.substeps - 1
+            self.batch.step(ids=self.ids, stage=_VEL if last else 0)
+            self._keep_momentum(last)
+
+    def _keep_momentum(self, last: bool) -> None:
+        n, root = len(self.ids), self.links[0]
+        q, v = self.scene.agent_qpos(0).start, self.scene.agent_qvel(0).start
+        with np.errstate(all="ignore"):  # a candidate may diverge; its cost then is the highest
+            _, change, shift = self.keeper.correct(
+                Tree(
+                    cinert=self._cinert[:n, self._tree],
+                    cvel=self._cvel[:n, self._tree],
+                    com=self._com[:n, root],
+                    root_pos=self.xpos[:n, root],
+                    root_quat=self.xquat[:n, root],
+                    root_force=self._constraint[:n, v : v + 6],
+                ),
+                current=last,
+            )
+        self.qvel[:n, v : v + 6] += change
+        self.qpos[:n, q : q + 3] += shift
+        self._shift = shift  # the engine computed the links' positions before it
+
+    @property
+    def link_pos(self) -> np.ndarray:
+        """(N, B, 3) positions of the links (m)."""
+        return self.xpos[: len(self.ids), self.links] + self._shift[:, None]
+
+    @property
+    def whole(self) -> np.ndarray:
+        """(N, 9) centre of mass (m), its velocity (m/s), angular momentum about it (N m s)."""
+        momentum = self.keeper.target
+        return np.hstack(
+            [self.keeper.path, momentum[:, 3:] / self.scene.body.mass, momentum[:, :3]]
+        )
 
     def kinematics(self, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, ...]:
         """Of T frames: link positions (T, B, 3), attitudes (T, B, 4) and ``whole`` (T, 9)."""
@@ -126,7 +160,10 @@ class _Worlds:
             data.qpos[self.scene.agent_qpos(0)] = p
             data.qvel[self.scene.agent_qvel(0)] = v
             mujoco.mj_forward(self.model, data)
-            rows.append((data.xpos[self.links], data.xquat[self.links], data.sensordata.copy()))
+            momentum = spatial_momentum(data.cinert[self._tree], data.cvel[self._tree])
+            velocity = momentum[3:] / self.scene.body.mass
+            whole = np.concatenate([data.subtree_com[self.links[0]], velocity, momentum[:3]])
+            rows.append((data.xpos[self.links], data.xquat[self.links], whole))
         return tuple(np.array(x) for x in zip(*rows))
 
 
@@ -325,9 +362,9 @@ def _rollout(
     for k in range(targets.shape[1]):
         worlds.step(targets[:, k])
         at = now + k + 1
-        pos, quat = worlds.xpos[:count, worlds.links], worlds.xquat[:count, worlds.links]
+        pos, quat = worlds.link_pos, worlds.xquat[:count, worlds.links]
         rate = worlds.qvel[:count, v][:, 6:] - frames.qvel[at, 6:]
-        whole = (worlds.whole[:count] - frames.whole[at]) ** 2
+        whole = (worlds.whole - frames.whole[at]) ** 2
         distance = np.sum((pos - frames.link_pos[at]) ** 2, axis=2).mean(1)
         dot = np.einsum("nbi,bi->nb", quat, frames.link_quat[at])
         step = (

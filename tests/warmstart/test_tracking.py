@@ -5,13 +5,15 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from sports.humanoid.body import load_body
 from sports.humanoid.mjcf import build_model
+from sports.physics import PhysicsState, make_physics
 from sports.scene import humanoid_scene
 from warmstart.clip import Clip
 from warmstart.replay import play, scene_of
-from warmstart.tracking import Tracking, track
+from warmstart.tracking import Tracking, _Worlds, track
 
 BODY = load_body("smpl", strength="human")
 LIGHT = Tracking(worlds=24, horizon=8, knot_every=2, iterations=2, noise=0.2)
@@ -65,17 +67,41 @@ def test_progress_counts_every_control_step(hop, tracked):
     assert steps == [(i, hop.num_frames - 1) for i in range(1, hop.num_frames)]
 
 
-def test_every_frame_follows_from_the_one_before_in_plain_mujoco(tracked):
+def test_every_frame_follows_from_the_one_before_in_the_engine(tracked):
+    """The worlds that candidates are simulated in are those that an environment has."""
     clip = tracked[0].clip
     scene = scene_of(clip)
-    model = build_model(scene)
-    data = mujoco.MjData(model)
-    for t in range(clip.num_frames - 1):
-        mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = clip.qpos[t], clip.qvel[t], clip.ctrl[t]
-        mujoco.mj_step(model, data, nstep=scene.substeps)
-        # The solver starts cold here: contact forces agree to its tolerance only.
-        assert np.abs(data.qpos - clip.qpos[t + 1]).max() < 1e-3
+    physics = make_physics("mujoco", scene, clip.num_frames - 1)
+    state = PhysicsState(
+        torch.tensor(clip.qpos[:-1], dtype=torch.float32),
+        torch.tensor(clip.qvel[:-1], dtype=torch.float32),
+        torch.zeros(clip.num_frames - 1, 0, 3),
+    )
+    physics.reset(torch.ones(clip.num_frames - 1, dtype=torch.bool), state)
+    physics.step(torch.tensor(clip.ctrl[:-1], dtype=torch.float32))
+    # The solver starts cold here: contact forces agree to its tolerance only.
+    assert np.abs(physics.qpos.numpy() - clip.qpos[1:]).max() < 1e-3
+    physics.close()
+
+
+def test_a_flight_in_the_worlds_has_one_ballistic_path():
+    """Thrown up and flailing: the momentum that tracking reads is that of a thrown stone."""
+    scene = humanoid_scene(BODY)
+    worlds = _Worlds(scene, 2, threads=1)
+    qpos, qvel = scene.default_qpos(), np.zeros(scene.nv)
+    qpos[2], qvel[0], qvel[2] = 3.0, 2.0, 2.0
+    start = worlds.kinematics(qpos[None], qvel[None])[2][0]
+    worlds.put(2, qpos, qvel, np.zeros(scene.nv))
+    rng = np.random.default_rng(0)
+    for step in range(1, 19):
+        worlds.step(rng.uniform(-1.5, 1.5, (2, BODY.num_dofs)))
+        t = step * scene.control_timestep
+        fallen = start[:6] + np.array([*start[3:5] * t, 0.0, 0.0, 0.0, -9.81 * t])
+        fallen[2] += start[5] * t - 4.905 * t * (t + scene.timestep)  # semi-implicit steps
+        measured = worlds.kinematics(worlds.qpos, worlds.qvel)[2]
+        assert np.abs(measured[:, :3] - fallen[:3]).max() < 1e-3
+        assert np.abs(measured[:, 3:6] - fallen[3:]).max() < 1e-3
+        assert np.abs(measured - worlds.whole).max() < 1e-3
 
 
 def test_targets_are_actions_that_a_policy_can_take(tracked):

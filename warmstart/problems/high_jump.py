@@ -29,6 +29,8 @@ _PARABOLA = 8.0
 """Curvature (1/m) of the keep-out parabola; up to 1 / (2 radius) = 20 would contain the bar."""
 _COVERED = ("Neck", "Thorax", "Wrist", "Spine")
 """Links whose balls lie inside the hull of their neighbours."""
+_TRUNK = ("Chest", "Head", "L_Shoulder", "R_Shoulder")
+"""Links that would fall back onto a low bar after the landing."""
 
 
 @dataclass(frozen=True)
@@ -121,10 +123,12 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     def land(q, p):
         motion = model.motion(q)
         corners = [motion.point(model.tree.link(b.link), b.center) for b in right]
+        trunk = [motion.point(model.tree.link(link), (0, 0, 0))[0] for link in _TRUNK]
         return [
             ("landing height", ca.vertcat(*[c[2] for c in corners]), 0.0, 0.03),
             ("landing beyond the bar", ca.vertcat(*[c[0] for c in corners]), BAR_X + 0.2, np.inf),
             ("root beyond the bar", q[0], BAR_X + 0.3, np.inf),
+            ("trunk beyond the bar", ca.vertcat(*trunk), BAR_X + 0.15, np.inf),
             ("root height", q[2], 0.70, 1.2),
         ]
 

@@ -24,6 +24,9 @@ from warmstart.solution import Solution
 from warmstart.transcription import Transcription
 
 LINE_X = 20.0
+CARRY = 0.14
+"""The centre of mass lands behind the length by at most its forward speed times this (s): an
+athlete further back sits down before the marks have stopped counting, 0.3 s later."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,8 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
             ("toes beyond the length", ca.vertcat(*[s[0] for s in soles]), 0.0, np.inf),
             ("body behind the feet", LINE_X + p[0] - com[0], -0.2, 0.75),
             ("carried forward", velocity[0], 1.5, np.inf),
-            ("trunk over the legs", com[2], 0.50, 1.3),
+            ("carried over the feet", LINE_X + p[0] - com[0] - CARRY * velocity[0], -np.inf, 0.0),
+            ("trunk over the legs", com[2], 0.55, 1.3),
         ]
 
     program.rows("landing", [program.K - 1], land, rates=True)
