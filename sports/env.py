@@ -148,7 +148,7 @@ class Env:
         self.physics.step(ctrl.flatten(1))
         self.view.clock = self.view.clock + 1
         self.age = self.age + 1
-        self.view.heading = Heading(self.physics.body_quat[:, :, 0])
+        self.view.refresh()
 
         step = self.task.advance(self.view, self.memory)
         self.memory = step.memory
@@ -195,7 +195,7 @@ class Env:
         zero = torch.zeros((), dtype=torch.long, device=self.device)
         self.view.clock = torch.where(mask, zero, self.view.clock)
         self.age = torch.where(mask, zero, self.age)
-        self.view.heading = Heading(self.physics.body_quat[:, :, 0])
+        self.view.refresh()
         fresh = self.task.begin(self.view, context)
         if not self.memory:
             self.memory = fresh
@@ -233,7 +233,10 @@ class Env:
                 slices[f"goal/{name}"] = slice(at, at + value.shape[-1])
                 at += value.shape[-1]
             self.obs_slices = slices
-        obs = torch.cat((proprioception(self.physics, self.view.heading), *goal.values()), dim=-1)
+        obs = torch.cat(
+            (proprioception(self.physics, self.view.heading, self.view.rotation), *goal.values()),
+            dim=-1,
+        )
         return torch.nan_to_num(obs)
 
     def snapshot(self) -> dict[str, Tensor]:
@@ -282,7 +285,7 @@ class Env:
         self.generator.set_state(moved["generator"].cpu())
         self.memory = {k[7:]: v for k, v in moved.items() if k.startswith("memory/")}
         self.view.curriculum = {k[11:]: v for k, v in moved.items() if k.startswith("curriculum/")}
-        self.view.heading = Heading(self.physics.body_quat[:, :, 0])
+        self.view.refresh()
         return self._observe()
 
     def close(self) -> None:

@@ -45,16 +45,18 @@ def proprioception_slices(num_links: int) -> dict[str, slice]:
     return slices
 
 
-def proprioception(physics: Physics, heading: Heading) -> Tensor:
+def proprioception(physics: Physics, heading: Heading, rotation: Tensor | None = None) -> Tensor:
     """(N, A, 15 B - 2) what an athlete feels of its own body: SMPL 358, SMPL-X 778.
 
     Order: root height; link positions relative to the root; link rotations in 6-D (first two
     columns of the rotation matrix, Zhou et al. 2019); linear and angular velocities; all but
-    the height in the heading frame.
+    the height in the heading frame. ``rotation``: R_WB (N, A, B, 3, 3), where it is at hand.
     """
+    if rotation is None:
+        rotation = quaternion.matrix(physics.body_quat)
     n, a, b = physics.body_pos.shape[:3]
     root = physics.body_pos[:, :, :1]
-    columns = quaternion.matrix(physics.body_quat)[..., :2].transpose(-1, -2)  # (N, A, B, 2, 3)
+    columns = rotation[..., :2].transpose(-1, -2)  # (N, A, B, 2, 3)
     vectors = torch.cat(
         (
             physics.body_pos[:, :, 1:] - root,

@@ -272,10 +272,10 @@ def _goal(root: Tensor) -> Tensor:
 def _lowest_over_bar(view: View) -> Tensor:
     """(N,) z of the lowest body point within 5 cm of the bar's plane; inf if there is none."""
     geometry = view.geometry
-    points = geometry.world_points(view.physics.body_pos[:, 0], view.physics.body_quat[:, 0])
+    points = geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0])
     over = (points[..., 0] - BAR_X).abs() < 0.05
-    bottom = points[..., 2] - geometry.radii
-    return torch.where(over, bottom, torch.full_like(bottom, torch.inf)).amin(-1)
+    bottom = points[..., 2] - geometry.link_radii
+    return torch.where(over, bottom, torch.inf).flatten(1).amin(-1)
 
 
 TASK = Task(

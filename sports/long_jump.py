@@ -59,9 +59,10 @@ def begin(view: View, context: Memory) -> Memory:
     """Memory after a reset: running, no mark yet."""
     root = view.root_pos[:, 0]
     zero = torch.zeros_like(root[:, 0])
+    points = view.geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0])
     return {
         "root": root.clone(),
-        "rear": _rear(view),
+        "rear": _rear(view, points[..., 0]),
         "mode": zero.long(),
         "since_landing": zero.clone(),
         "mark": torch.full_like(zero, torch.inf),
@@ -88,20 +89,19 @@ def advance(view: View, memory: Memory) -> Advance:
     goal = constant(GOAL, root.device)
     touched = view.touching()[:, 0]  # (N, B) in any substep
     geometry = view.geometry
-    points = geometry.world_points(view.physics.body_pos[:, 0], view.physics.body_quat[:, 0])
-    on_ground = points[..., 2] - geometry.radii < TOUCH  # (N, K) now
-    link_on_ground = torch.zeros_like(touched, dtype=torch.long).index_add(
-        1, geometry.owner, on_ground.long()
-    )
-    rear = _rear(view)
+    rotation = view.rotation[:, 0]
+    points = geometry.link_points(view.physics.body_pos[:, 0], rotation)  # (N, B, K', 3)
+    points_x = points[..., 0]
+    on_ground = points[..., 2] - geometry.link_radii < TOUCH  # (N, B, K') now
+    rear = _rear(view, points_x)
     # A link that touched within the step and is off again: all of it was at or beyond this x.
-    brief = touched & (link_on_ground == 0)
+    brief = touched & ~on_ground.any(-1)
     brief_x = torch.where(brief, torch.minimum(rear, memory["rear"]), torch.inf)
-    any_contact = touched.any(-1) | on_ground.any(-1)
+    any_contact = touched.any(-1) | on_ground.flatten(1).any(-1)
 
     mode = memory["mode"]
     running = mode == RUN
-    front = torch.where(on_ground, points[..., 0], -torch.inf).amax(-1)
+    front = torch.where(on_ground, points_x, -torch.inf).flatten(1).amax(-1)
     brief_front = torch.where(brief, brief_x, -torch.inf).amax(-1)
     foul = running & ((front >= LINE_X) | (brief_front >= LINE_X))
     fell = running & view.fallen()[:, 0]
@@ -113,7 +113,7 @@ def advance(view: View, memory: Memory) -> Advance:
     mode = torch.where(takes_off, FLIGHT, torch.where(lands, LANDED, mode))
     landed = mode == LANDED
     nearest = torch.minimum(
-        torch.where(on_ground, points[..., 0], torch.inf).amin(-1), brief_x.amin(-1)
+        torch.where(on_ground, points_x, torch.inf).flatten(1).amin(-1), brief_x.amin(-1)
     )
     mark = torch.where(landed, torch.minimum(memory["mark"], nearest), memory["mark"])
     since_landing = memory["since_landing"] + (landed & ~lands)
@@ -130,7 +130,7 @@ def advance(view: View, memory: Memory) -> Advance:
         "length": torch.where(success, 30.0 * length, 0.0),
     }
 
-    com, com_velocity = geometry.center_of_mass(view.physics, agent=0)
+    com, com_velocity = geometry.center_of_mass(view.physics, 0, rotation)
     takeoff_speed = torch.where(takes_off, com_velocity.norm(dim=-1), memory["takeoff_speed"])
     takeoff_com_z = torch.where(takes_off, com[:, 2], memory["takeoff_com_z"])
     landing_com_z = torch.where(lands, com[:, 2], memory["landing_com_z"])
@@ -171,11 +171,9 @@ def length_bound(speed: Tensor, takeoff_z: Tensor, landing_z: Tensor) -> Tensor:
     return speed / GRAVITY * drop.sqrt() + 1.2
 
 
-def _rear(view: View) -> Tensor:
-    """(N, B) smallest x of each link."""
-    back = constant((-1.0, 0.0, 0.0), view.clock.device)
-    physics = view.physics
-    return -view.geometry.extent(physics.body_pos[:, 0], physics.body_quat[:, 0], back)
+def _rear(view: View, points_x: Tensor) -> Tensor:
+    """(N, B) smallest x of each link, of its support points' x (N, B, K')."""
+    return (points_x - view.geometry.link_radii).amin(-1)
 
 
 TASK = Task(

@@ -26,12 +26,18 @@ def conjugate(q: Tensor) -> Tensor:
     return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
 
 
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """(..., 3) cross product; several times faster than torch's own on a CPU."""
+    ax, ay, az = a.unbind(-1)
+    bx, by, bz = b.unbind(-1)
+    return torch.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), dim=-1)
+
+
 def rotate(q: Tensor, v: Tensor) -> Tensor:
     """(..., 3) vector ``v`` rotated by ``q``."""
     w, u = q[..., :1], q[..., 1:]
-    u, v = torch.broadcast_tensors(u, v)
-    t = 2.0 * torch.linalg.cross(u, v)
-    return v + w * t + torch.linalg.cross(u, t)
+    t = 2.0 * cross(u, v)
+    return v + w * t + cross(u, t)
 
 
 def matrix(q: Tensor) -> Tensor:

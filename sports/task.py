@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sports import quaternion
 from sports.frames import Heading
 from sports.humanoid.body import Body
 from sports.physics.base import Geometry, Physics, PhysicsState
@@ -38,6 +39,19 @@ class View:
     foot_links: Tensor
     """(B,) bool: ankles and toes, the links that may touch the ground."""
     head_index: int
+    _rotation: Tensor | None = None
+
+    def refresh(self) -> None:
+        """Tells the view that the engine's tensors have changed."""
+        self.heading = Heading(self.physics.body_quat[:, :, 0])
+        self._rotation = None
+
+    @property
+    def rotation(self) -> Tensor:
+        """(N, A, B, 3, 3) R_WB of the links, computed once a step."""
+        if self._rotation is None:
+            self._rotation = quaternion.matrix(self.physics.body_quat)
+        return self._rotation
 
     @property
     def root_pos(self) -> Tensor:

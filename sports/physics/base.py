@@ -161,18 +161,39 @@ class Geometry:
     def _padded_radii(self) -> Tensor:
         return self.radii[self.padded]
 
+    def link_points(self, body_pos: Tensor, rotation: Tensor) -> Tensor:
+        """(..., B, K', 3) support points in the world, by link and padded by repetition to the
+        link with most; the balls around them have ``link_radii`` (B, K'). ``rotation`` is R_WB
+        (..., B, 3, 3)."""
+        # Written out: a batch of tiny matrix products is slow on a CPU.
+        x, y, z = rotation[..., None, :, :].unbind(-1)  # columns, (..., B, 1, 3)
+        px, py, pz = self._padded_points[..., None].unbind(-2)  # (B, K', 1)
+        return body_pos[..., None, :] + x * px + y * py + z * pz
+
+    @property
+    def link_radii(self) -> Tensor:
+        """(B, K') radii of the balls around ``link_points``."""
+        return self._padded_radii
+
     def world_points(self, body_pos: Tensor, body_quat: Tensor) -> Tensor:
         """(..., K, 3) support points in the world; the balls around them have ``radii``."""
         pos, quat = body_pos[..., self.owner, :], body_quat[..., self.owner, :]
         return pos + quaternion.rotate(quat, self.points)
 
-    def center_of_mass(self, physics: Physics, agent: int) -> tuple[Tensor, Tensor]:
-        """(N, 3) centre of mass of an athlete (m) and (N, 3) its velocity (m/s), world frame."""
-        arm = quaternion.rotate(physics.body_quat[:, agent], self.center)  # (N, B, 3)
-        share = (self.mass / self.mass.sum())[:, None]
-        spin = torch.linalg.cross(physics.body_angvel[:, agent], arm)
-        position = ((physics.body_pos[:, agent] + arm) * share).sum(1)
-        return position, ((physics.body_linvel[:, agent] + spin) * share).sum(1)
+    def center_of_mass(
+        self, physics: Physics, agent: int, rotation: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """(N, 3) centre of mass of an athlete (m) and (N, 3) its velocity (m/s), world frame.
+
+        ``rotation``: R_WB of the agent's links (N, B, 3, 3), where it is at hand.
+        """
+        if rotation is None:
+            rotation = quaternion.matrix(physics.body_quat[:, agent])
+        arm = (rotation @ self.center[..., None])[..., 0]  # (N, B, 3)
+        share = self.mass / self.mass.sum()
+        spin = quaternion.cross(physics.body_angvel[:, agent], arm)
+        position = share @ (physics.body_pos[:, agent] + arm)
+        return position, share @ (physics.body_linvel[:, agent] + spin)
 
     def extent(self, body_pos: Tensor, body_quat: Tensor, direction: Tensor) -> Tensor:
         """(..., B) furthest reach along unit ``direction`` (3,) of each link, m."""

@@ -16,6 +16,7 @@ from sports.humanoid.mjcf import body_name, build_model
 from sports.physics.base import Geometry, PhysicsState, default_state, diverged
 from sports.physics.momentum import MomentumKeeper, Tree
 from sports.physics.variation import Draw, Variation, draw
+from sports.quaternion import cross
 from sports.scene import Scene
 
 _VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -58,7 +59,10 @@ class MujocoPhysics:
         )
         self._objects = np.array([model.body(o.name).id for o in scene.free_objects], dtype=int)
         every = np.concatenate((self._ids.ravel(), self._objects))
-        self._rows, self._roots = every, model.body_rootid[every]
+        self._rows: slice | np.ndarray = every
+        if np.array_equal(every, np.arange(every[0], every[0] + len(every))):
+            self._rows = slice(int(every[0]), int(every[0]) + len(every))  # copies faster
+        self._roots = model.body_rootid[every]
         self._mocap_rows = [model.body(o.name).mocapid[0] for o in scene.mocap_objects]
         self._shape = (agents, links)
         self._num_ground = agents * links
@@ -192,30 +196,31 @@ class MujocoPhysics:
     def _read(self) -> None:
         """Copies the engine's float64 rows into the float32 tensors of the protocol."""
         n, (agents, links) = self.num_worlds, self._shape
+        k = agents * links
         self.qpos = torch.from_numpy(self._qpos.astype(np.float32))
         self.qvel = torch.from_numpy(self._qvel.astype(np.float32))
         if self._mocap is not None:
             self.mocap_pos = torch.from_numpy(self._mocap[:, self._mocap_rows].astype(np.float32))
-        k = agents * links
-        position = self._xpos[:, self._rows]
-        spin = self._cvel[:, self._rows, :3]
-        linear = self._cvel[:, self._rows, 3:]
-        # cvel is taken at the centre of mass of the kinematic tree; move it to the link origin.
-        velocity = linear + np.cross(spin, position - self._com[:, self._roots])
+        # In float64, since the centre of mass is subtracted from positions far from the origin.
+        arm = self._xpos[:, self._rows] - self._com[:, self._roots]
+        pos = _float(self._xpos[:, self._rows])
+        quat, twist = _float(self._xquat[:, self._rows]), _float(self._cvel[:, self._rows])
         # The last substep's correction came after the engine had computed these.
-        spin[:, :k] += np.repeat(self._twist[:, :, :3], links, axis=1)
-        arm = position[:, :k] - self._com[:, self._roots[:k]]
-        turn = np.repeat(self._twist[:, :, :3], links, axis=1)
-        velocity[:, :k] += np.repeat(self._twist[:, :, 3:], links, axis=1) + np.cross(turn, arm)
-        position[:, :k] += np.repeat(self._shift, links, axis=1)
-        pos = torch.from_numpy(position.astype(np.float32))
-        quat = torch.from_numpy(self._xquat[:, self._rows].astype(np.float32))
-        lin = torch.from_numpy(velocity.astype(np.float32))
-        ang = torch.from_numpy(spin.astype(np.float32))
+        shift, change = _float(self._shift), _float(self._twist)
+        pos[:, :k].view(n, agents, links, 3).add_(shift[:, :, None])
+        twist[:, :k].view(n, agents, links, 6).add_(change[:, :, None])
+        # cvel is taken at the centre of mass of the kinematic tree; move it to the link origin.
+        ang = twist[..., :3]
+        lin = twist[..., 3:] + cross(ang, _float(arm))
         self.body_pos, self.object_pos = pos[:, :k].view(n, agents, links, 3), pos[:, k:]
         self.body_quat, self.object_quat = quat[:, :k].view(n, agents, links, 4), quat[:, k:]
         self.body_linvel, self.object_linvel = lin[:, :k].view(n, agents, links, 3), lin[:, k:]
-        self.body_angvel, self.object_angvel = ang[:, :k].view(n, agents, links, 3), ang[:, k:]
-        forces = torch.from_numpy(self._forces.astype(np.float32))
-        self.ground_force = forces[:, :k].reshape(n, agents, links, 3)
+        self.body_angvel, self.object_angvel = ang[:, :k].unflatten(1, self._shape), ang[:, k:]
+        forces = _float(self._forces)
+        self.ground_force = forces[:, :k].view(n, agents, links, 3)
         self.pair_force = forces[:, k:].norm(dim=-1)
+
+
+def _float(values: np.ndarray) -> Tensor:
+    """A float32 copy as a tensor."""
+    return torch.from_numpy(values.astype(np.float32))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from sports.env import Env, make_env
-from sports.frames import Heading
 from sports.physics import PhysicsState, default_state
 
 
@@ -46,7 +45,7 @@ class HandMade:
         physics = self.env.physics
         everyone = torch.ones(self.env.num_worlds, dtype=torch.bool)
         physics.reset(everyone, self.state)
-        self.env.view.heading = Heading(physics.body_quat[:, :, 0])
+        self.env.view.refresh()
 
     def begin(self) -> None:
         """Starts an episode in the placed state."""

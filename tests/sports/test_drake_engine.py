@@ -192,19 +192,28 @@ def test_a_touched_bar_reports_the_force_and_falls():
 
 
 def test_pushed_bar_leaves_its_groove_as_in_mujoco():
-    """At 0.3 m/s sideways it rolls back, at 0.7 m/s it falls, in both engines alike."""
+    """At 0.3 m/s sideways it rolls back, at 0.7 m/s it falls, on the same path in both engines.
+
+    How high it bounces on the ground is another matter: there they may differ.
+    """
     scene = high_jump.scene(high_jump.HighJump(bar_height=1.0), load_body())
     state = default_state(scene, 2, "cpu")
     state.qvel[:, scene.object_qvel("bar").start] = torch.tensor([0.3, 0.7])
-    bars = []
+    paths = []
     for engine in ("mujoco", "drake"):
         physics = make_physics(engine, scene, 2)
         physics.reset(torch.ones(2, dtype=torch.bool), state)
-        for _ in range(20):
+        path = []
+        for _ in range(26):
             physics.step(torch.zeros(2, scene.nu))
-        bars.append(physics.object_pos[:, 0])
-    assert bars[1][0, 2].item() > 0.97 and bars[1][1, 2].item() < 0.1
-    torch.testing.assert_close(bars[1], bars[0], atol=0.02, rtol=0)
+            path.append(physics.object_pos[:, 0].clone())
+        paths.append(torch.stack(path))
+    mujoco, drake = paths
+    falling = int((mujoco[:, 1, 2] > 0.1).sum())
+    assert falling >= 10
+    torch.testing.assert_close(drake[:falling], mujoco[:falling], atol=0.02, rtol=0)
+    assert drake[-1, 0, 2].item() > 0.97 and drake[-1, 1, 2].item() < 0.06
+    torch.testing.assert_close(drake[-1], mujoco[-1], atol=0.02, rtol=0)
 
 
 def test_permuting_the_worlds_permutes_everything():
@@ -245,14 +254,20 @@ def test_a_bad_world_is_counted_and_does_not_spread():
 
 
 def test_flailing_on_the_ground_stays_finite_and_above_it():
+    """Slamming limbs of 500 N m sink into Drake's ground less than into MuJoCo's softer one."""
     scene = humanoid_scene(load_body())
-    drake = make_physics("drake", scene, 1)
-    drake.reset(EVERY, default_state(scene, 1, "cpu"))
-    generator = torch.Generator().manual_seed(2)
-    for _ in range(45):
-        drake.step(0.8 * torch.randn(1, scene.nu, generator=generator))
-        assert not drake.bad.any()
-        assert drake.extent(torch.tensor([0.0, 0.0, -1.0])).max().item() < 0.03
+    depth = {}
+    for engine in ("mujoco", "drake"):
+        physics = make_physics(engine, scene, 1)
+        physics.reset(EVERY, default_state(scene, 1, "cpu"))
+        generator = torch.Generator().manual_seed(2)
+        down, deepest = torch.tensor([0.0, 0.0, -1.0]), -np.inf
+        for _ in range(45):
+            physics.step(0.8 * torch.randn(1, scene.nu, generator=generator))
+            assert not physics.bad.any()
+            deepest = max(deepest, physics.extent(down).max().item())
+        depth[engine] = deepest
+    assert 0.0 < depth["drake"] < min(depth["mujoco"], 0.05)
 
 
 def test_effort_limit_holds():
