@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -68,7 +69,9 @@ class Program:
     scale: list[float] = field(default_factory=list)
     blocks: list[Block] = field(default_factory=list)
 
-    def variable(self, shape: Sequence[int], lower, upper, scale=1.0) -> np.ndarray:
+    def variable(
+        self, shape: Sequence[int], lower, upper, scale: float | np.ndarray = 1.0
+    ) -> np.ndarray:
         """Adds variables with physical bounds; returns their indices in ``shape``.
 
         ``lower``, ``upper`` and ``scale`` broadcast to ``shape``; the solver sees
@@ -84,7 +87,7 @@ class Program:
         self,
         name: str,
         inputs: Sequence[np.ndarray],
-        build: Callable[..., tuple[object, list[tuple[str, object, object, object]]]],
+        build: Callable[..., tuple[Any, Sequence[tuple[str, Any, Any, Any]]]],
         data: np.ndarray | None = None,
     ) -> None:
         """Adds copies of one small function.
