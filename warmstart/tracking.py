@@ -124,10 +124,13 @@ class _Worlds:
         n, root = len(self.ids), self.links[0]
         q, v = self.scene.agent_qpos(0).start, self.scene.agent_qvel(0).start
         with np.errstate(all="ignore"):  # a candidate may diverge; its cost then is the highest
+            cinert = self._cinert[:n, self._tree]
+            momentum = spatial_momentum(cinert, self._cvel[:n, self._tree])
             _, change, shift = self.keeper.correct(
                 Tree(
-                    cinert=self._cinert[:n, self._tree],
-                    cvel=self._cvel[:n, self._tree],
+                    inertia=cinert.sum(1)[:, :6],
+                    angular=momentum[:, :3],
+                    velocity=momentum[:, 3:] / self.scene.body.mass,
                     com=self._com[:n, root],
                     root_pos=self.xpos[:n, root],
                     root_quat=self.xquat[:n, root],

@@ -3,7 +3,8 @@
 Gains act as ``stiffness = position servo limited to +-effort``, ``damping = passive joint
 damping``: a clamped damper inside the actuator stops damping and explodes (measured). Contact
 forces come from contact sensors (``netforce``): one per athlete link against the ground, then
-one per named pair of the scene, three numbers each, world frame.
+one per named pair of the scene; then each athlete's angular momentum about its centre of mass and
+the velocity of that centre. Three numbers each, world frame.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ def _side(scene: Scene, name: str) -> tuple[mujoco.mjtObj, str]:
     return mujoco.mjtObj.mjOBJ_BODY, name
 
 
-def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
+def _add_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
     def add(name: str, a: tuple[mujoco.mjtObj, str], b: tuple[mujoco.mjtObj, str]) -> None:
         # MuJoCo reports the force on the second object: our first side, world frame.
         sensor = spec.add_sensor(
@@ -135,9 +136,18 @@ def _add_contact_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
             add(f"ground:{name}", (mujoco.mjtObj.mjOBJ_BODY, name), ground)
     for a, b in scene.contact_pairs:
         add(f"pair:{a}:{b}", _side(scene, a), _side(scene, b))
+    for agent in range(scene.num_agents):
+        root = body_name(agent, scene.body.links[0].name)
+        for kind in ("ANGMOM", "LINVEL"):
+            spec.add_sensor(
+                name=f"{kind.lower()}:{root}",
+                type=getattr(mujoco.mjtSensor, f"mjSENS_SUBTREE{kind}"),
+                objtype=mujoco.mjtObj.mjOBJ_BODY,
+                objname=root,
+            )
 
 
-def build_spec(scene: Scene, contact_sensors: bool = True) -> mujoco.MjSpec:
+def build_spec(scene: Scene, sensors: bool = True) -> mujoco.MjSpec:
     """The scene as an MjSpec: ground, athletes, objects, actuators, sensors, exclusions."""
     spec = mujoco.MjSpec()
     spec.modelname = scene.name
@@ -164,16 +174,16 @@ def build_spec(scene: Scene, contact_sensors: bool = True) -> mujoco.MjSpec:
         _add_agent(spec, scene, i)
     for obj in scene.objects:
         _add_object(spec, obj)
-    if contact_sensors:
-        _add_contact_sensors(spec, scene)
+    if sensors:
+        _add_sensors(spec, scene)
     return spec
 
 
-def build_model(scene: Scene | Body, contact_sensors: bool = True) -> mujoco.MjModel:
+def build_model(scene: Scene | Body, sensors: bool = True) -> mujoco.MjModel:
     """Compiles a scene, or one athlete alone on the ground, with ``qpos0`` at its start."""
     if isinstance(scene, Body):
         scene = humanoid_scene(scene)
-    model = build_spec(scene, contact_sensors).compile()
+    model = build_spec(scene, sensors).compile()
     if (model.nq, model.nv, model.nu) != (scene.nq, scene.nv, scene.nu):
         raise RuntimeError(f"scene '{scene.name}': compiled model has an unexpected layout")
     return model

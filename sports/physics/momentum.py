@@ -12,8 +12,7 @@ which holds for any rigid-body system (Newton and Euler; Featherstone 2008, sect
 forces are the engine's own: the constraint forces on the free joint of the root. In flight the
 centre of mass is also put back on the path of that momentum; on the ground the contacts decide.
 
-Momentum is taken at the centre of mass, world axes: ``(L, P)``, N m s and N s. Inertias and
-velocities are MuJoCo's ``cinert`` and ``cvel``, which refer to that point.
+Momentum is taken at the centre of mass, world axes: ``(L, P)``, N m s and N s.
 """
 
 from __future__ import annotations
@@ -28,7 +27,10 @@ NO_FORCE = 0.1
 
 
 def spatial_momentum(cinert: np.ndarray, cvel: np.ndarray) -> np.ndarray:
-    """(..., 6) summed over links: ``cinert`` (..., B, 10), ``cvel`` (..., B, 6)."""
+    """(..., 6) angular, then linear momentum summed over links, at the centre of mass.
+
+    ``cinert`` (..., B, 10) and ``cvel`` (..., B, 6) are MuJoCo's, which refer to that point.
+    """
     i = np.moveaxis(cinert, -1, 0)
     v = np.moveaxis(cvel, -1, 0)
     rows = (
@@ -53,14 +55,28 @@ def rotation(quat: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """(N, 3) solution of N systems (N, 3, 3) by Cramer's rule; NaN, never an error, for the
+    world of an athlete whose inertia has become singular (it has diverged)."""
+    a, b, c = matrix[:, :, 0], matrix[:, :, 1], matrix[:, :, 2]
+    bc = np.cross(b, c)
+    with np.errstate(all="ignore"):
+        determinant = np.einsum("ni,ni->n", a, bc)[:, None]
+        rows = (bc, np.cross(c, a), np.cross(a, b))
+        numerator = np.stack([np.einsum("ni,ni->n", r, right) for r in rows], axis=1)
+        return numerator / determinant
+
+
 @dataclass
 class Tree:
     """One athlete of every world, as the engine's derived fields show it."""
 
-    cinert: np.ndarray
-    """(N, B, 10)"""
-    cvel: np.ndarray
-    """(N, B, 6)"""
+    inertia: np.ndarray
+    """(N, 6) of the whole athlete about its centre of mass: xx, yy, zz, xy, xz, yz."""
+    angular: np.ndarray
+    """(N, 3) angular momentum about the centre of mass."""
+    velocity: np.ndarray
+    """(N, 3) of the centre of mass."""
     com: np.ndarray
     """(N, 3)"""
     root_pos: np.ndarray
@@ -99,7 +115,7 @@ class MomentumKeeper:
         (N, 6) the same as a change of the free joint's ``qvel``, (N, 3) shift of the root.
         """
         h = np.broadcast_to(np.asarray(self.timestep, dtype=float), tree.com.shape[:1])[:, None]
-        momentum = spatial_momentum(tree.cinert, tree.cvel)
+        momentum = np.concatenate((tree.angular, self.mass * tree.velocity), axis=1)
         matrix = rotation(tree.root_quat)
         arm = tree.root_pos - tree.com
         force = tree.root_force[:, :3]
@@ -111,9 +127,8 @@ class MomentumKeeper:
         expected = self.target + impulse if current else self.target
         error = np.where(known, expected - momentum, 0.0)
         twist = np.empty_like(error)
-        inertia = tree.cinert.sum(1)
-        tensor = inertia[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
-        twist[:, :3] = np.linalg.solve(tensor, error[:, :3, None])[..., 0]
+        tensor = tree.inertia[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
+        twist[:, :3] = _solve(tensor, error[:, :3])
         twist[:, 3:] = error[:, 3:] / self.mass
         self.target = momentum + error + (0.0 if current else impulse)
 

@@ -48,7 +48,7 @@ class MujocoPhysics:
         self._xpos, self._xquat, self._cvel = bind("xpos"), bind("xquat"), bind("cvel")
         self._com, self._sensors = bind("subtree_com"), bind("sensordata")
         self._warmstart = bind("qacc_warmstart")
-        self._cinert, self._constraint = bind("cinert"), bind("qfrc_constraint")
+        self._crb, self._constraint = bind("crb"), bind("qfrc_constraint")
 
         agents, links = scene.num_agents, scene.body.num_links
         self._ids = np.array(
@@ -75,7 +75,7 @@ class MujocoPhysics:
         self.bad = torch.zeros(n, dtype=torch.bool)
         self.nan_worlds = 0
         self.overflow = 0
-        self._forces = np.zeros((n, model.nsensordata // 3, 3))
+        self._forces = np.zeros((n, self._num_ground + len(scene.contact_pairs), 3))
         self._keepers = [MomentumKeeper(n, scene.body.mass, scene.timestep) for _ in range(agents)]
         self._twist, self._shift = np.zeros((n, agents, 6)), np.zeros((n, agents, 3))
         self._timesteps: list[np.ndarray] | None = None
@@ -109,7 +109,7 @@ class MujocoPhysics:
                 self._timestep[:] = self._timesteps[i].reshape(self._timestep.shape)
             self.batch.step(stage=_VEL if last else 0)
             self._keep_momentum(i, last)
-            now = self._sensors.reshape(self.num_worlds, -1, 3)
+            now = self._sensors.reshape(self.num_worlds, -1, 3)[:, : self._forces.shape[1]]
             norm = np.einsum("nsi,nsi->ns", now, now)
             if forces is None:
                 forces, largest = now.copy(), norm
@@ -129,14 +129,17 @@ class MujocoPhysics:
 
     def _keep_momentum(self, substep: int, last: bool) -> None:
         """Undoes the integrator's drift of every athlete's momentum; see ``momentum.py``."""
+        forces = self._num_ground + len(self.scene.contact_pairs)
+        sensors = self._sensors.reshape(self.num_worlds, -1, 3)[:, forces:]
         for agent, keeper in enumerate(self._keepers):
             if self._timesteps is not None:
                 keeper.timestep = self._timesteps[substep]
-            links, root = self._ids[agent], self._ids[agent, 0]
+            root = self._ids[agent, 0]
             v, q = self.scene.agent_qvel(agent).start, self.scene.agent_qpos(agent).start
             tree = Tree(
-                cinert=self._cinert[:, links[0] : links[-1] + 1],
-                cvel=self._cvel[:, links[0] : links[-1] + 1],
+                inertia=self._crb[:, root, :6],
+                angular=sensors[:, 2 * agent],
+                velocity=sensors[:, 2 * agent + 1],
                 com=self._com[:, root],
                 root_pos=self._xpos[:, root],
                 root_quat=self._xquat[:, root],

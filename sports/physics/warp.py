@@ -233,7 +233,7 @@ class WarpPhysics:
         wp.init()
         self._wp_device = wp.device_from_torch(self.device)
         # Contact sensors sort all contacts for every sensor; summing them here is 9 % faster.
-        self.model = model = build_model(scene, contact_sensors=False)
+        self.model = model = build_model(scene, sensors=False)
         # Warp never resets a diverged world by itself, and does not know the flag that says so.
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         model.opt.iterations, model.opt.ls_iterations = iterations, line_search
