@@ -108,7 +108,8 @@ class MujocoPhysics:
             if self._timesteps is not None:
                 self._timestep[:] = self._timesteps[i].reshape(self._timestep.shape)
             self.batch.step(stage=_VEL if last else 0)
-            self._keep_momentum(i, last)
+            with np.errstate(all="ignore"):  # diverged worlds, found below
+                self._keep_momentum(i, last)
             now = self._sensors.reshape(self.num_worlds, -1, 3)[:, : self._forces.shape[1]]
             norm = np.einsum("nsi,nsi->ns", now, now)
             if forces is None:
