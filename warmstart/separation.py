@@ -19,22 +19,31 @@ from warmstart.contact import Ball
 if TYPE_CHECKING:
     from warmstart.transcription import Transcription
 
-ALLOWED = 0.005
-"""How far (m) a limb may reach over its border: less than half of what the certificate allows."""
+ALLOWED = 0.002
+"""How far (m) a limb may reach over its border. The certificate allows two limbs 0.02 m, but a
+foot is longer than the ball that stands for it."""
+CORNERS = 0.04
+"""How much further (m) a hand keeps from a foot: corners stick out of the balls in both boxes."""
 LEG = ("Hip", "Knee", "Ankle", "Toe")
 HAND = ("Wrist", "Hand")
 
 
 def axis_balls(body: Body, link: str, count: int = 2) -> list[Ball]:
-    """Balls along a link's first shape: ``count`` on a capsule's axis, one in a box.
+    """Balls along a link's first shape: ``count`` on a capsule's axis, one or two in a box.
 
-    A box's ball has its middle half-extent as radius (half the width of a foot).
+    A box's balls have its middle half-extent as radius (half the width of a foot) and reach both
+    ends of its longest side; one does where that is hardly longer.
     """
     shape: Shape = body.links[body.link_index(link)].shapes[0]
     center = np.array(shape.center)
     if shape.end is None:
-        radius = sorted(shape.size)[1] if shape.kind == "box" else shape.size[0]
-        points, radius = [center], float(radius)
+        points, radius = [center], float(shape.size[0])
+        if shape.kind == "box":
+            size = np.array(shape.size)
+            radius = float(np.sort(size)[1])
+            reach = np.where(size == size.max(), size - radius, 0.0)
+            if reach.max() > 0.02:
+                points = [center - reach, center + reach]
     else:
         share = np.linspace(0.0, 1.0, count)
         points = [center + s * (np.array(shape.end) - center) for s in share]
@@ -43,7 +52,7 @@ def axis_balls(body: Body, link: str, count: int = 2) -> list[Ball]:
 
 
 def keep_apart(program: Transcription, body: Body, knots: Sequence[int] | np.ndarray) -> None:
-    """Adds the rows at knots: legs and hands on their sides, hands off the legs (40 a knot)."""
+    """Adds the rows at knots: legs and hands on their sides, hands off the legs (46 a knot)."""
     import casadi as ca
 
     model = program.model
@@ -76,7 +85,8 @@ def keep_apart(program: Transcription, body: Body, knots: Sequence[int] | np.nda
         for side in "LR":
             for a in hands[side]:
                 for b in lifted[side]:
-                    reach = a.radius + b.radius - ALLOWED
+                    corners = CORNERS if b.link.endswith(("Ankle", "Toe")) else 0.0
+                    reach = a.radius + b.radius + corners - ALLOWED
                     gaps.append(ca.sumsqr(at(motion, a) - at(motion, b)) - reach**2)
         return [("hands off the legs", ca.vertcat(*gaps) / 0.05, 0.0, np.inf)]
 

@@ -67,11 +67,15 @@ def test_poses_that_satisfy_the_rows_do_not_overlap():
     assert accepted > 20 and crossed > 10  # both kinds were tried
 
 
-@pytest.mark.parametrize("link", ["L_Hip", "R_Knee", "L_Toe", "R_Hand"])
+@pytest.mark.parametrize("link", ["L_Hip", "R_Knee", "L_Toe", "R_Ankle", "R_Hand"])
 def test_balls_lie_on_the_axis_of_their_shape(link):
     shape = BODY.links[BODY.link_index(link)].shapes[0]
     balls = axis_balls(BODY, link, 3)
-    assert len(balls) == (3 if shape.kind == "capsule" else 1)
+    assert len(balls) == (3 if shape.kind == "capsule" else 2 if link == "R_Ankle" else 1)
+    if link == "R_Ankle":  # the balls reach heel and front of the foot
+        reach = [b.center[0] + s * b.radius for b, s in zip(balls, (-1, 1))]
+        front = shape.center[0] + np.array([-1, 1]) * shape.size[0]
+        assert np.allclose(reach, front)
     middle = np.mean([b.center for b in balls], axis=0)
     end = shape.center if shape.end is None else shape.end
     assert np.allclose(middle, (np.array(shape.center) + end) / 2)

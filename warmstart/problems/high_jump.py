@@ -78,22 +78,25 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     body = load_body("smpl", strength=config.strength)
     model = jumper.make_model(body)
     knots = jumper.scaled(config.detail)
+    higher = float(np.clip(config.bar_height - 1.2, 0.0, 0.4))
+    turn = 2.0 * higher  # lies down over a high bar, and moves abruptly: finer knots
     phases = [
         Phase("flat", knots(14), (0.09, 0.30), {"L": "flat"}),
         Phase("toe", knots(8), (0.04, 0.15), {"L": "toe"}),
-        Phase("flight", knots(36), (0.30, 1.20), grading=3.0),
+        Phase("flight", knots(36 + round(80 * higher)), (0.30, 1.20), grading=3.0),
     ]
     position = jumper.boxes(jumper.POSITION) | {
         "x": (BAR_X - 5, BAR_X + 3),
         "y": (LANE_Y - 0.5, LANE_Y + 0.5),
         "z": (0.5, 3.0),
-        "roll": (-0.35, 0.35),
+        "roll": (-0.35 - turn, 0.35 + turn),
     }
+    rate = jumper.boxes(jumper.RATE) | {"roll": (-3.0 - 5 * turn, 3.0 + 5 * turn)}
     program = Transcription(
         body,
         model,
         phases,
-        Bounds(position, jumper.boxes(jumper.RATE)),
+        Bounds(position, rate),
         held_limits=jumper.HELD_LIMITS,
         flight_limits=jumper.FLIGHT_LIMITS,
         parameters=1,
@@ -104,7 +107,8 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     flight = program.knots("flight")
     wide = ("Ankle", "Toe", "Pelvis")
     balls = [b for b in outline(body) if b.link.endswith(wide)]
-    balls += [b for b in outline(body, sagittal=True) if not b.link.endswith((*wide, *_COVERED))]
+    flat = outline(body, sagittal=turn == 0.0)  # who turns shows the bar every corner
+    balls += [b for b in flat if not b.link.endswith((*wide, *_COVERED))]
 
     def clear(q, p):
         motion = model.motion(q)
@@ -134,6 +138,7 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
 
     program.rows("end", [program.K - 1], land)
     program.bound(program.q[-1, model.index("pitch")], -0.4, 0.7)
+    program.bound(program.q[-1, model.index("roll")], -0.35, 0.35)
     return program
 
 

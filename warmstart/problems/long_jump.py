@@ -68,11 +68,10 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     model = jumper.make_model(body)
     knots = jumper.scaled(config.detail)
     beyond = max(config.length - 5.0, 0.0)
-    shortest = max(0.12 - 0.015 * beyond, 0.085)  # a faster run leaves less time on the foot
     phases = [
-        Phase("flat", knots(16), (0.625 * shortest, 0.25), {"L": "flat"}, grading=2.0),
-        Phase("toe", knots(9), (0.375 * shortest, 0.12), {"L": "toe"}),
-        Phase("flight", knots(60), (0.25, 1.20), grading=3.0),
+        Phase("flat", knots(16), (0.055, 0.25), {"L": "flat"}, grading=2.0),
+        Phase("toe", knots(9), (0.035, 0.12), {"L": "toe"}),
+        Phase("flight", knots(66), (0.25, 1.20), grading=3.0),
     ]
     position = jumper.boxes(jumper.POSITION) | {
         "x": (LINE_X - 3, LINE_X + 12),
