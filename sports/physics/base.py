@@ -202,12 +202,13 @@ class Geometry:
         return (body_pos * direction).sum(-1) + reach.amax(-1)
 
 
-SPEED_LIMIT = 200.0
-"""A generalised velocity above this (m/s or rad/s) means that a world has diverged."""
+SPEED_LIMIT = 2000.0
+"""A generalised velocity above this (m/s or rad/s) means that a world has diverged. A bar hit at
+12 m/s spins about its thin axis at 400 rad/s."""
 
 
 def diverged(qpos: Tensor, qvel: Tensor) -> Tensor:
-    """(N,) worlds whose numbers are not finite or beyond any athlete."""
+    """(N,) worlds whose numbers are not finite or beyond any athlete or bar."""
     return ~(
         torch.isfinite(qpos).all(-1)
         & torch.isfinite(qvel).all(-1)
