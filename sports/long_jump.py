@@ -5,6 +5,8 @@ until the first ground contact of any link, LANDED for 9 more steps; the length 
 of any ground contact point in those steps, minus 20. A link on the ground on or beyond the line
 before the flight is a foul. Source: SMPLOlympics section 4 for goal and reward; World Athletics
 technical rules for the foul and for measuring to the nearest mark left by any part of the body.
+Those rules also forbid somersaults; the paper's task does not, so ``rotation`` tells them apart: the
+angle that the pelvis turns about the lateral axis in flight (2 pi for a front somersault).
 """
 
 from __future__ import annotations
@@ -67,6 +69,7 @@ def begin(view: View, context: Memory) -> Memory:
         "since_landing": zero.clone(),
         "mark": torch.full_like(zero, torch.inf),
         "flight_steps": zero.clone(),
+        "rotation": zero.clone(),
         "takeoff_speed": torch.full_like(zero, torch.nan),
         "takeoff_com_z": torch.full_like(zero, torch.nan),
         "landing_com_z": torch.full_like(zero, torch.nan),
@@ -135,11 +138,14 @@ def advance(view: View, memory: Memory) -> Advance:
     takeoff_com_z = torch.where(takes_off, com[:, 2], memory["takeoff_com_z"])
     landing_com_z = torch.where(lands, com[:, 2], memory["landing_com_z"])
     flight_steps = memory["flight_steps"] + flying
+    turn = view.physics.body_angvel[:, 0, 0, 1] * view.control_timestep
+    rotation_angle = memory["rotation"] + turn * flying
     legal = ~success
     metrics = {
         "success": success.float(),
         "length": nan_where(legal, length),
         "flight_time": nan_where(legal, flight_steps * view.control_timestep),
+        "rotation": nan_where(legal, rotation_angle),
         "takeoff_speed": nan_where(legal, takeoff_speed),
         "length_bound": nan_where(legal, length_bound(takeoff_speed, takeoff_com_z, landing_com_z)),
         "foul": foul.float(),
@@ -151,6 +157,7 @@ def advance(view: View, memory: Memory) -> Advance:
         "since_landing": since_landing,
         "mark": mark,
         "flight_steps": flight_steps,
+        "rotation": rotation_angle,
         "takeoff_speed": takeoff_speed,
         "takeoff_com_z": takeoff_com_z,
         "landing_com_z": landing_com_z,
@@ -188,6 +195,7 @@ TASK = Task(
         "success": "fraction",
         "length": "m",
         "flight_time": "s",
+        "rotation": "rad",
         "takeoff_speed": "m/s",
         "length_bound": "m",
         "foul": "fraction",

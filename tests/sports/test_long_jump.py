@@ -159,6 +159,22 @@ def test_reward_terms_match_the_formulas():
     assert world.advance().terms["flight"][0, 0] == pytest.approx(0.13, abs=1e-6)
 
 
+def test_a_somersault_is_told_by_its_rotation():
+    """Ten steps in the air at 6 rad/s about the lateral axis turn the athlete by 2 rad."""
+    world = HandMade("long_jump")
+    world.place((19.0, 0, STANDING))
+    world.begin()
+    world.place((20.3, 0, 1.5))
+    world.state.qvel[:, 4] = 6.0
+    for _ in range(10):
+        world.advance()
+    world.state.qvel[:, 4] = 0.0
+    world.place((23.0, 0, 0.9))
+    world.drop_to_ground("L_Ankle")
+    last = [world.advance({"L_Ankle": 400.0}) for _ in range(10)][-1]
+    assert last.metrics["rotation"][0] == pytest.approx(10 / 30 * 6.0, abs=1e-4)
+
+
 def test_length_bound_is_the_best_ballistic_range():
     """Independent: the range maximised over the angle by brute force."""
     speed, drop, g = 9.5, 0.6, 9.81
