@@ -5,8 +5,8 @@ until the first ground contact of any link, LANDED for 9 more steps; the length 
 of any ground contact point in those steps, minus 20. A link on the ground on or beyond the line
 before the flight is a foul. Source: SMPLOlympics section 4 for goal and reward; World Athletics
 technical rules for the foul and for measuring to the nearest mark left by any part of the body.
-Those rules also forbid somersaults; the paper's task does not, so ``rotation`` tells them apart: the
-angle that the pelvis turns about the lateral axis in flight (2 pi for a front somersault).
+Those rules also forbid somersaults; the paper's task does not, so ``rotation`` tells them apart:
+the angle that the pelvis turns about the lateral axis in flight (2 pi for a front somersault).
 """
 
 from __future__ import annotations
