@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,6 +29,7 @@ import numpy as np
 
 from sports.humanoid.mjcf import body_name, build_model
 from sports.scene import humanoid_scene
+from warmstart.atomic import write_text
 from warmstart.inverse_dynamics import inverse_dynamics_drake, inverse_dynamics_mujoco
 from warmstart.outcome import OUTCOMES, support
 from warmstart.replay import replay
@@ -170,15 +170,7 @@ class Certificate:
 
     def to_json(self, path: str | Path) -> None:
         """Writes ``certificate.json`` atomically."""
-        path = Path(path)
-        text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        try:
-            temporary.write_text(text + "\n")
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_text(path, json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
 
     @staticmethod
     def from_json(path: str | Path) -> Certificate:

@@ -39,15 +39,17 @@ def demonstrate(
     solution: Solution,
     settings: Tracking | None = None,
     *,
+    certificate: Certificate | None = None,
     attempts: int = 3,
     threads: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Demonstration:
     """Certifies a solution and tracks it in its task.
 
-    Raises ValueError when the solution's problem is no task.
+    A ``certificate`` of the solution, where there is one already, is taken as it is. Raises
+    ValueError when the solution's problem is no task.
     """
-    certificate = certify(solution)
+    certificate = certificate or certify(solution)
     if not certificate.passed:
         return Demonstration(certificate, None, "; ".join(certificate.failures))
     try:
@@ -60,7 +62,7 @@ def demonstrate(
     meta = {
         **clip.meta,
         "certified": True,
-        "planned": certificate.achieved["planned"],
+        "planned": certificate.achieved.get("planned"),
         "link_error": tracked.link_error,
         "root_error": tracked.root_error,
     }

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import os
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -17,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from warmstart.atomic import write_bytes
 
 MAX_BYTES = 256 * 2**20
 """Largest file, unpacked, that is read: three hours of motion at 30 Hz."""
@@ -35,13 +36,7 @@ def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray], meta: Mapping[
         raise ValueError(f"{path}: the metadata is not plain JSON: {error}") from error
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, meta=np.array(text), **dict(arrays))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(buffer.getvalue())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(path, buffer.getvalue())
 
 
 def read_npz(

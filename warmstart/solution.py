@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from sports.humanoid.body import Body, load_body
+from warmstart.atomic import write_bytes
 
 _ARRAYS = {
     "times": 1,
@@ -156,13 +156,7 @@ class Solution:
         buffer = io.BytesIO()
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         np.savez_compressed(buffer, meta=np.array(json.dumps(meta)), **arrays)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        try:
-            temporary.write_bytes(buffer.getvalue())
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_bytes(path, buffer.getvalue())
 
     @staticmethod
     def load(path: str | Path) -> Solution:

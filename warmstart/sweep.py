@@ -27,6 +27,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from warmstart.atomic import write_json
+
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -103,7 +105,7 @@ def sweep(
 
         _run(jobs, todo, min(processes, max(len(todo), 1)), continuation, finished)
     results = [done[v] for v in values]
-    _write(out / "sweep.json", {**head, "results": [asdict(r) for r in results]})
+    write_json(out / "sweep.json", {**head, "results": [asdict(r) for r in results]})
     if show:
         Console(stderr=True).print(table(results, field))
     return results
@@ -170,7 +172,7 @@ def _run(
                 if process.exitcode != 0 or result is None:
                     reason = f"its process ended with code {process.exitcode}"
                     result = Result(jobs[value].name, value, "crashed", reason, seconds, {})
-                    _write(Path(jobs[value].out) / f"{result.name}.json", asdict(result))
+                    write_json(Path(jobs[value].out) / f"{result.name}.json", asdict(result))
                 finished(value, result)
     finally:
         for _, process, _ in running.values():
@@ -191,7 +193,7 @@ def _neighbour(job: _Job, values: list[float]) -> str | None:
 def _child(job: _Job) -> None:
     """What a spawned process runs: a solve, and its result on disk."""
     result = _solve(job)
-    _write(Path(job.out) / f"{result.name}.json", asdict(result))
+    write_json(Path(job.out) / f"{result.name}.json", asdict(result))
 
 
 def _solve(job: _Job) -> Result:
@@ -248,7 +250,7 @@ def _claim(out: Path, head: dict[str, Any]) -> None:
                 f"{other['options']}; choose another directory"
             )
     else:
-        _write(path, {**head, "results": []})
+        write_json(path, {**head, "results": []})
 
 
 def _read(out: Path, name: str) -> Result | None:
@@ -259,15 +261,6 @@ def _read(out: Path, name: str) -> Result | None:
         return None
     solved = result.status in ("certified", "solved", "rejected")
     return None if solved and not (out / f"{name}.npz").is_file() else result
-
-
-def _write(path: Path, data: dict[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(json.dumps(data, indent=1) + "\n")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _progress(show: bool) -> Progress:
