@@ -29,12 +29,12 @@ import torch
 import tyro
 from torch import Tensor
 
-from olympics_opt.atomic import write_json
 from rl import provenance
 from rl.ppo import PPO, PPOConfig
 from rl.rollout import collect
 from sports.env import Env, make_env
 from sports.registry import get_task, task_names
+from warmstart.atomic import write_json
 
 Engine = Literal["mujoco", "warp", "drake"]
 WORLDS = {"mujoco": 256, "warp": 8192, "drake": 4}

@@ -13,7 +13,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from olympics_opt import atomic
+from warmstart import atomic
 
 BEGIN, END = "<!-- results -->", "<!-- /results -->"
 REQUIRED = ("task", "algo", "engine", "strength", "trials", "seed", "commit", "metrics")

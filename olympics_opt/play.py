@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from olympics_opt import atomic
 from olympics_opt.progress import progress
+from warmstart import atomic
 
 if TYPE_CHECKING:
     from olympics_opt.cli import Evaluate, Render

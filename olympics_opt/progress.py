@@ -25,6 +25,7 @@ class Bar:
 @contextmanager
 def progress(description: str) -> Iterator[Bar]:
     """Shows a line while the body runs; without a terminal only its final state is printed."""
+    from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (
@@ -34,5 +35,7 @@ def progress(description: str) -> Iterator[Bar]:
         TimeElapsedColumn(),
         TextColumn("{task.fields[detail]}"),
     )
-    with Progress(*columns, refresh_per_second=4) as display:
+    # In a notebook too the line is plain text: rich's live display there needs ipywidgets.
+    console = Console(force_jupyter=False)
+    with Progress(*columns, console=console, refresh_per_second=4) as display:
         yield Bar(display, description)

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from olympics_opt.atomic import write_bytes
 from olympics_opt.episode import Episode, Player, Window, decisive_window, heading, touching
 from olympics_opt.raycast import View, draw
 from olympics_opt.scenery import LIMBS, ground_marks
 from olympics_opt.video import render_video
+from warmstart.atomic import write_bytes
 
 __all__ = ["render_sheet", "render_video", "sheet_frames", "side_views"]
 

@@ -6,7 +6,6 @@ it in MuJoCo with feedback. Only what passed is written as a demonstration.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +18,8 @@ if TYPE_CHECKING:
     from olympics_opt.report.page import Plots, Section, Tiles
     from warmstart.certificate import Certificate
     from warmstart.clip import Clip
+    from warmstart.demonstration import Demonstration
     from warmstart.solution import Solution
-    from warmstart.tracking import Tracked
 
 SOLUTION, DEMO, CERTIFICATE, PREVIEW = (
     "solution.npz",
@@ -44,15 +43,15 @@ def run_solve(config: Solve) -> int:
     (config.out / DEMO).unlink(missing_ok=True)  # of an earlier solve with other options
     solution = optimise(config.name, problem_config, config.out)
     certificate = certify_solution(solution, config.out)
-    tracked = None
+    found = None
     if certificate.passed and config.track:
-        tracked = track_clip(solution, certificate, config.out)
+        found = make_demonstration(solution, certificate, config.out)
     elif certificate.passed:
         from warmstart.clip import clip_from_solution
 
         clip_from_solution(solution).save(config.out / DEMO)
-    write_preview(solution, certificate, tracked, config.out / PREVIEW)
-    _print_outcome(solution, certificate, tracked, config.out)
+    write_preview(solution, certificate, found, config.out / PREVIEW)
+    _print_outcome(solution, certificate, found, config.out)
     return 0 if (config.out / DEMO).is_file() else 1
 
 
@@ -84,35 +83,31 @@ def certify_solution(solution: Solution, out: Path) -> Certificate:
     return certificate
 
 
-def track_clip(solution: Solution, certificate: Certificate, out: Path, seed: int = 0) -> Tracked:
+def make_demonstration(
+    solution: Solution, certificate: Certificate, out: Path, seed: int = 0
+) -> Demonstration:
     """Follows a certified solution in MuJoCo with feedback; writes demo.npz where it succeeds.
 
     Success is what the task's own rules call so; the clip is labelled with what it achieved.
     """
-    from warmstart.tracking import Tracking, track_best
+    from warmstart.demonstration import demonstrate
+    from warmstart.tracking import Tracking
 
     with progress("tracking in MuJoCo") as bar:
-        tracked = track_best(
+        found = demonstrate(
             solution,
-            settings=Tracking(seed=seed),
+            Tracking(seed=seed),
+            certificate=certificate,
             progress=lambda i, n: bar.show(f"step {i} of {n}", i, n),
         )
-        word = "success" if tracked.success else "no success"
-        bar.finish(f"{word}, links {100 * tracked.link_error:.1f} cm off")
-    if tracked.success:
-        meta = {
-            **tracked.clip.meta,
-            "certified": certificate.passed,
-            "planned": certificate.achieved.get("planned"),
-            "link_error": tracked.link_error,
-            "root_error": tracked.root_error,
-        }
-        replace(tracked.clip, meta=meta).save(out / DEMO)
-    return tracked
+        bar.finish("success" if found.passed else "no success")
+    if found.passed and found.clip is not None:
+        found.clip.save(out / DEMO)
+    return found
 
 
 def write_preview(
-    solution: Solution, certificate: Certificate, tracked: Tracked | None, path: Path
+    solution: Solution, certificate: Certificate, found: Demonstration | None, path: Path
 ) -> Path:
     """The page of one optimised motion: asked, achieved, checks, plots, replay, provenance."""
     from olympics_opt.report import sections
@@ -123,12 +118,13 @@ def write_preview(
     unit = get_problem(solution.problem).unit
     facts = certificate.to_dict()
     tiles = sections.asked_achieved_tiles(solution.asked, certificate.achieved, unit)
+    tracked = found.clip if found is not None else None
     blocks = [tiles, *([tracking_tiles(tracked)] if tracked is not None else [])]
     page = Page(
         f"{solution.problem.replace('_', ' ').capitalize()}: an optimised motion",
         [
             Section("Asked and achieved", blocks),
-            motion_replay(solution, tracked.clip if tracked is not None else None),
+            motion_replay(solution, tracked),
             Section("The motion over time", [solution_plots(solution)]),
             sections.certificate_section(facts),
             sections.provenance_section(
@@ -149,11 +145,11 @@ def write_preview(
     return write_page(page, path)
 
 
-def tracking_tiles(tracked: Tracked) -> Tiles:
+def tracking_tiles(tracked: Clip) -> Tiles:
     """What MuJoCo made of the motion."""
     from olympics_opt.report.page import Tile, Tiles, number
 
-    achieved = tracked.clip.meta.get("achieved", {})
+    achieved = tracked.meta.get("achieved", {})
     success = achieved.get("success")
     tiles = [
         Tile(
@@ -164,7 +160,7 @@ def tracking_tiles(tracked: Tracked) -> Tiles:
             "by the rules of the sport",
             "" if success is None else "good" if success > 0.5 else "bad",
         ),
-        Tile("link error", f"{100 * tracked.link_error:.1f} cm", "root mean square"),
+        Tile("link error", f"{100 * tracked.meta['link_error']:.1f} cm", "root mean square"),
     ]
     skip = ("success", "foul", "knocked", "bar_height")
     tiles += [
@@ -231,7 +227,7 @@ def motion_replay(solution: Solution, tracked: Clip | None) -> Section:
 
 
 def _print_outcome(
-    solution: Solution, certificate: Certificate, tracked: Tracked | None, out: Path
+    solution: Solution, certificate: Certificate, found: Demonstration | None, out: Path
 ) -> None:
     from olympics_opt.report.page import number
 
@@ -242,17 +238,14 @@ def _print_outcome(
     asked = ", ".join(f"{k} {number(v)}" for k, v in solution.asked.items())
     achieved = ", ".join(f"{k} {number(v)}" for k, v in certificate.achieved.items())
     print(f"asked: {asked}; achieved: {achieved or 'nothing'}")
-    if tracked is not None:
-        print(
-            f"tracked in MuJoCo: links {100 * tracked.link_error:.1f} cm off, "
-            + ", ".join(
-                f"{k} {number(float(v))}" for k, v in tracked.clip.meta.get("achieved", {}).items()
-            )
-        )
+    if found is not None and found.clip is not None:
+        meta = found.clip.meta
+        outcome = ", ".join(f"{k} {number(float(v))}" for k, v in meta.get("achieved", {}).items())
+        print(f"tracked in MuJoCo: links {100 * meta['link_error']:.1f} cm off, {outcome}")
     if not certificate.passed:
         print(f"not certified, so no demonstration is written: {'; '.join(certificate.failures)}")
-    elif not (out / DEMO).is_file():
-        print("certified, but MuJoCo did not succeed with it: no demonstration is written")
+    elif found is not None and found.reason:
+        print(f"certified, but no demonstration is written: {found.reason}")
     names = (n for n in (DEMO, CERTIFICATE, PREVIEW) if (out / n).is_file())
     print(f"wrote {', '.join(str(out / n) for n in names)}")
 

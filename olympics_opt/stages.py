@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from olympics_opt import atomic
+from warmstart import atomic
 
 MANIFEST, STARTED = "stage.json", "started.json"
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from olympics_opt import atomic
 from olympics_opt.solve import CERTIFICATE, DEMO, SOLUTION
 from olympics_opt.stages import Done, Stage, run_stages
+from warmstart import atomic
 
 if TYPE_CHECKING:
     from olympics_opt.cli import Study
@@ -115,19 +115,20 @@ def make_stages(config: Study, plan: Plan, policy_sha256: str) -> list[Stage]:
         return {"passed": True, "achieved": certificate.achieved}
 
     def warm_start(folder: Path) -> dict[str, Any]:
-        from olympics_opt.solve import track_clip
+        from olympics_opt.solve import make_demonstration
         from warmstart.certificate import Certificate
         from warmstart.solution import Solution
 
         solution = Solution.load(out / "solve" / SOLUTION)
         certificate = Certificate.from_json(out / "certify" / CERTIFICATE)
-        tracked = track_clip(solution, certificate, folder, config.seed)
+        found = make_demonstration(solution, certificate, folder, config.seed)
+        meta = found.clip.meta if found.clip is not None else {}
         return {
-            "success": tracked.success,
-            "achieved": tracked.clip.meta.get("achieved", {}),
-            "link_error": tracked.link_error,
-            "root_error": tracked.root_error,
-            "seconds": tracked.seconds,
+            "success": found.passed,
+            "reason": found.reason,
+            "achieved": meta.get("achieved", {}),
+            "link_error": meta.get("link_error"),
+            "root_error": meta.get("root_error"),
         }
 
     def train(folder: Path) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from olympics_opt import atomic
+from warmstart import atomic
 
 if TYPE_CHECKING:
     from olympics_opt.cli import Verify

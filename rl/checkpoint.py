@@ -20,6 +20,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from warmstart.atomic import write_bytes
+
 FORMAT = "olympics-opt checkpoint 1"
 SHARD_BYTES = 15 * 2**20
 """No file of a checkpoint is larger."""
@@ -29,20 +31,6 @@ KEEP = 2
 
 class CheckpointError(RuntimeError):
     """A checkpoint could not be written or read; the message is a sentence with the remedy."""
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Writes a whole file or none: a temporary file beside it, flushed to disk, then renamed."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with open(part, "wb") as f:
-            f.write(data)
-            f.flush()
-            os.fsync(f.fileno())
-        os.replace(part, path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
 
 
 def checkpoints(run: Path) -> list[Path]:
@@ -81,12 +69,12 @@ def save_checkpoint(
         if barrier is not None:
             barrier()
         index = _write_shards(part, rank, tensors)
-        write_atomically(part / f"rank{rank}.json", json.dumps(index).encode())
+        write_bytes(part / f"rank{rank}.json", json.dumps(index).encode())
         if barrier is not None:
             barrier()
         if rank == 0:
             text = json.dumps({"format": FORMAT, "iteration": iteration, **state}, indent=1)
-            write_atomically(part / "state.json", text.encode())
+            write_bytes(part / "state.json", text.encode())
             if final.exists():  # saved before at this iteration, for instance by a signal
                 shutil.rmtree(final)
             os.replace(part, final)
@@ -124,7 +112,7 @@ def _write_shards(folder: Path, rank: int, tensors: dict[str, Tensor]) -> dict[s
         if shard:
             name = f"rank{rank}_{len(index['sha256']):03d}.safetensors"
             data = save(shard)
-            write_atomically(folder / name, data)
+            write_bytes(folder / name, data)
             index["sha256"][name] = hashlib.sha256(data).hexdigest()
             shard.clear()
 

@@ -19,8 +19,9 @@ from safetensors.torch import save
 from torch import Tensor
 
 from rl import pretrained
-from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint, write_atomically
+from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.networks import MLP
+from warmstart.atomic import write_bytes, write_text
 
 FORMAT = "olympics-opt policy 1"
 BASELINES = ("zero", "random")
@@ -270,7 +271,7 @@ def export_policy(
         card["looks"] = looks
     path = Path(out).with_suffix(".safetensors")
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, data)
+    write_bytes(path, data)
     text = json.dumps(card, indent=1, allow_nan=False)
-    write_atomically(path.with_suffix(".json"), text.encode())
+    write_text(path.with_suffix(".json"), text)
     return path

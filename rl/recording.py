@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from rl.checkpoint import write_atomically
 from sports.env import make_scene
 from sports.scene import Scene
+from warmstart.atomic import write_bytes
 
 FORMAT = "olympics-opt recording 1"
 
@@ -78,7 +78,7 @@ class Recording:
         data = io.BytesIO()
         np.savez_compressed(data, meta=np.array(json.dumps(meta)), **arrays)  # type: ignore[arg-type]
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, data.getvalue())
+        write_bytes(path, data.getvalue())
 
     @staticmethod
     def load(path: str | Path) -> Recording:

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rl.checkpoint import write_atomically
+from warmstart.atomic import write_text
 
 Row = dict[str, float | int | None]
 
@@ -30,7 +30,7 @@ class RunLog:
         writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-        write_atomically(self.path, text.getvalue().encode())
+        write_text(self.path, text.getvalue())
         self._file = open(self.path, "a", newline="")
         self._csv = csv.DictWriter(self._file, columns, lineterminator="\n")
         self._events = _event_writer(out / "tensorboard", after)

@@ -30,7 +30,6 @@ from rl.checkpoint import (
     load_checkpoint,
     read_state,
     save_checkpoint,
-    write_atomically,
 )
 from rl.imitation import Imitation
 from rl.meter import EpisodeMeter
@@ -41,6 +40,7 @@ from rl.rollout import collect
 from rl.runlog import Row, RunLog
 from sports.env import Env, Starts, make_env
 from sports.physics.variation import Variation
+from warmstart.atomic import write_text
 
 DEFAULT_WORLDS = {"mujoco": 256, "warp": 8192, "drake": 4}
 DEFAULT_SAMPLES = 100_000_000
@@ -437,7 +437,7 @@ class _Trainer:
             "hardware": provenance.hardware(),
         }
         text = json.dumps(data, indent=1, default=str)
-        write_atomically(c.out / "config.json", text.encode())
+        write_text(c.out / "config.json", text)
 
     def card(self) -> dict[str, Any]:
         """What the policy file says about itself; see rl.policy."""

@@ -15,8 +15,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Literal, Protocol
 
-from olympics_opt import atomic
 from olympics_opt.report.plots import Plot, svg
+from warmstart import atomic
 
 Tone = Literal["", "good", "bad", "warn"]
 VIDEO_LIMIT = 8 * 2**20

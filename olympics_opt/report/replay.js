@@ -267,9 +267,7 @@ const Replay = (() => {
     readTheme();
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { readTheme(); request(); });
     if (window.ResizeObserver) new ResizeObserver(request).observe(canvas);
-    const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
-    if (data.autoplay && !still) play(true);
-    else draw();
+    draw();
     return { seek, play, look, zoom, orbit, tracks, state, draw };
   }
 

@@ -203,7 +203,6 @@ def replay_data(
     tracks: Sequence[ReplayTrack],
     *,
     poster: float | None = None,
-    autoplay: bool = False,
 ) -> dict[str, Any]:
     """Everything the page's player needs, as plain JSON values.
 
@@ -212,7 +211,6 @@ def replay_data(
         tracks: at least one motion.
         poster: time of the picture before playing starts (s); by default the highest moment of
             the first track.
-        autoplay: start by itself, unless the reader asked for reduced motion.
 
     Raises:
         ValueError: no tracks, or a track that does not fit the scene.
@@ -230,7 +228,6 @@ def replay_data(
         "poster": round(poster, 4),
         "heading": round(heading, 4),
         "yaw": round(heading + math.radians(64), 4),
-        "autoplay": autoplay,
     }
 
 
@@ -275,7 +272,6 @@ def replay_html(
     title: str,
     element_id: str,
     poster: float | None = None,
-    autoplay: bool = False,
 ) -> str:
     """A replay as a self-contained HTML fragment: style, picture, controls, data and script.
 
@@ -286,7 +282,6 @@ def replay_html(
         title: read out for the picture.
         element_id: id of the fragment's outer element, unique on the page.
         poster: time of the first picture (s); default: highest moment of the first track.
-        autoplay: start by itself, unless the reader asked for reduced motion.
 
     Returns:
         HTML text. A page may hold several; the script is guarded against running twice.
@@ -296,7 +291,7 @@ def replay_html(
     """
     if not element_id.replace("-", "").replace("_", "").isalnum():
         raise ValueError(f"element id '{element_id}' may hold letters, digits, - and _ only")
-    data = replay_data(scene, tracks, poster=poster, autoplay=autoplay)
+    data = replay_data(scene, tracks, poster=poster)
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     script = "".join(map(_text, ("replay_scene.js", "replay_draw.js", "replay.js")))
     return (
@@ -312,60 +307,3 @@ def replay_html(
         "root, JSON.parse(root.querySelector('[data-replay=\"data\"]').textContent));}\n"
         "</script>\n</div>"
     )
-
-
-def preview_html(
-    scene: Scene,
-    tracks: Sequence[ReplayTrack],
-    *,
-    title: str,
-    subtitle: str = "",
-    facts: Sequence[tuple[str, str]] = (),
-    checks: Sequence[dict[str, Any]] = (),
-) -> str:
-    """A page of its own around a replay: what `solve` shows of a motion.
-
-    Args:
-        scene: athletes and objects.
-        tracks: motions.
-        title: heading.
-        subtitle: one sentence below it.
-        facts: (name, value) pairs.
-        checks: rows of a certificate: name, value, limit, unit, passed.
-
-    Returns:
-        A complete HTML document without external references.
-    """
-    rows = "".join(
-        f'<div class="tile"><div class="name">{escape(name)}</div>'
-        f'<div class="value">{escape(value)}</div></div>'
-        for name, value in facts
-    )
-    table = ""
-    if checks:
-        body = "".join(
-            f"<tr><td>{escape(str(c['name']))}</td>"
-            f'<td class="num">{_figure(c.get("value"))}</td>'
-            f'<td class="num">{_figure(c.get("limit"))}</td>'
-            f"<td>{escape(str(c.get('unit', '')))}</td>"
-            f'<td class="{"good" if c.get("passed") else "bad"}">'
-            f"{'passed' if c.get('passed') else 'FAILED'}</td></tr>"
-            for c in checks
-        )
-        table = (
-            '<h2>Certificate</h2><div class="scroll"><table><thead><tr><th>check</th>'
-            '<th class="num">value</th><th class="num">limit</th><th>unit</th><th></th></tr>'
-            f"</thead><tbody>{body}</tbody></table></div>"
-        )
-    replay = replay_html(scene, tracks, title=title, element_id="replay", autoplay=True)
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title>\n<style>{_text('style.css')}</style></head>\n<body>"
-        f'<h1>{escape(title)}</h1><p class="lead">{escape(subtitle)}</p>\n'
-        f'{replay}\n<div class="tiles">{rows}</div>\n{table}\n</body></html>\n'
-    )
-
-
-def _figure(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, int | float) else escape(str(value or ""))

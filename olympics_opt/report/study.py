@@ -80,7 +80,9 @@ def _summary(
         Tile(
             "tracked in MuJoCo",
             "success" if warm["success"] else "no",
-            f"links {100 * warm['link_error']:.1f} cm off (root mean square)",
+            f"links {100 * warm['link_error']:.1f} cm off (root mean square)"
+            if warm["link_error"] is not None
+            else warm["reason"],
             "good" if warm["success"] else "bad",
         ),
         *(

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from olympics_opt.report import replay
-from olympics_opt.report.replay import ReplayTrack, aligned, pack, preview_html, replay_html, unpack
+from olympics_opt.report.page import Fragment, Page, Section, render_page
+from olympics_opt.report.replay import ReplayTrack, aligned, pack, replay_html, unpack
 from sports.humanoid.body import load_body
 from sports.humanoid.mjcf import body_name, build_model
 from tests.olympics_opt.episodes import bar_scene, jump
@@ -123,7 +124,7 @@ def test_fragment_refers_to_nothing_outside_and_is_small() -> None:
         ReplayTrack.from_episode(jump(scene, "high_jump", frames=300, seed=s), f"track {s}")
         for s in range(3)
     ]
-    page = preview_html(scene, tracks, title="a < b & c", checks=[{"name": "x", "passed": True}])
+    page = replay_html(scene, tracks, title="a < b & c", element_id="three")
     assert not re.search(r"https?:|//[a-z]+\.|@import|url\(|\bsrc=|\bhref=|import\(", page)
     assert len(page.encode()) < 3 * 100_000 + 60_000
     one = replay_html(scene, tracks[:1], title="one", element_id="one")
@@ -190,12 +191,12 @@ def test_headless_browser_draws_the_athlete(tmp_path: Path) -> None:
     from PIL import Image
 
     scene = bar_scene()
-    page = preview_html(
-        scene, [ReplayTrack.from_episode(jump(scene, "high_jump"), "a")], title="jump"
-    ).replace('"autoplay":true', '"autoplay":false')
+    tracks = [ReplayTrack.from_episode(jump(scene, "high_jump"), "a")]
+    replay = replay_html(scene, tracks, title="jump", element_id="player")
+    page = render_page(Page("jump", [Section("Replay", [Fragment(replay)])]))
     errors = "<script>addEventListener('error', e => { document.title = e.message; });</script>"
     done = """<script>
-    const root = document.getElementById('replay'), player = root.replay, seen = [];
+    const root = document.getElementById('player'), player = root.replay, seen = [];
     const press = key => root.dispatchEvent(new KeyboardEvent('keydown', {key, bubbles: true}));
     const look = () => {
       player.draw();

@@ -193,7 +193,7 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("warmstart.npz.os.replace", full)
+    monkeypatch.setattr("os.replace", full)
     with pytest.raises(OSError, match="No space"):
         clip.save(tmp_path / "a.npz")
     assert (tmp_path / "a.npz").read_bytes() == before
