@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -35,7 +36,7 @@ def progress(description: str) -> Iterator[Bar]:
         TimeElapsedColumn(),
         TextColumn("{task.fields[detail]}"),
     )
-    # In a notebook too the line is plain text: rich's live display there needs ipywidgets.
-    console = Console(force_jupyter=False)
+    # A notebook is no terminal either: rich would want ipywidgets there, or draw every frame.
+    console = Console(force_jupyter=False, force_terminal=sys.stdout.isatty())
     with Progress(*columns, console=console, refresh_per_second=4) as display:
         yield Bar(display, description)
