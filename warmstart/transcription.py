@@ -336,6 +336,8 @@ class Transcription:
                 active = self.mode_points(side, k)
                 for point in active:
                     x[index[point, 2]] = 2 * self.weight / len(active)
+        if self.elastic:
+            x[self.slack] = 1.0
         return x
 
     def guess_from(self, solution: Solution) -> np.ndarray:
@@ -366,6 +368,8 @@ class Transcription:
                 if point in points:
                     for k, index in self.f[side].items():
                         x[index[i]] = s["contact_force"][k, points[point]]
+        if self.elastic:
+            x[self.slack] = 1.0
         return x
 
     def times(self, x: np.ndarray) -> np.ndarray:
