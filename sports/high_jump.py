@@ -231,7 +231,9 @@ def advance(view: View, memory: Memory) -> Advance:
     height_sum = memory["height_sum"] + z * near
     height_count = memory["height_count"] + near
     crossing_z = torch.where(crosses, at[:, 2], memory["crossing_z"])
-    lowest = torch.minimum(memory["lowest_over_bar"], _lowest_over_bar(view))
+    # An arm that swings back over the bar's plane after the landing is not the jump.
+    low_now = torch.where(memory["landed"] > 0, torch.inf, _lowest_over_bar(view))
+    lowest = torch.minimum(memory["lowest_over_bar"], low_now)
 
     mean_height = torch.where(height_count > 0, height_sum / height_count.clamp(min=1), crossing_z)
     metrics = {
