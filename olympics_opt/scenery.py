@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sports.humanoid.body import Body
 from sports.scene import Scene
 
 
@@ -97,11 +96,6 @@ def link_color(link: str) -> str:
         return HEAD if link in ("Head", "Neck") else TRUNK
     part = "arm" if rest in _ARM else "leg" if rest in _LEG else "foot" if rest in _FOOT else "hand"
     return LIMBS[f"{side}_{part}"]
-
-
-def link_colors(body: Body) -> list[str]:
-    """Colours of ``body.links``."""
-    return [link_color(name) for name in body.link_names]
 
 
 def complete_qpos(scene: Scene, qpos: np.ndarray) -> np.ndarray:

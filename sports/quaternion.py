@@ -63,10 +63,3 @@ def yaw(q: Tensor) -> Tensor:
     """(...) heading: angle about +z of the body's x axis projected on the ground (rad)."""
     w, x, y, z = q.unbind(-1)
     return torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-def from_yaw(angle: Tensor) -> Tensor:
-    """(..., 4) rotation by ``angle`` (rad) about +z."""
-    half = 0.5 * angle
-    zero = torch.zeros_like(half)
-    return torch.stack((torch.cos(half), zero, zero, torch.sin(half)), dim=-1)

@@ -109,11 +109,6 @@ class DrakeHumanoid:
         base = self.links[0].floating_velocities_start_in_v()
         return np.array([*range(base, base + 6), *(j.velocity_start() for j in self.joints)])
 
-    @cached_property
-    def u_index(self) -> np.ndarray:
-        """(num_dofs,) index into the plant's actuation of the dofs."""
-        return np.array([a.input_start() for a in self.actuators])
-
     def to_drake(self, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """MuJoCo state to this athlete's Drake state, ordered as `q_index` and `v_index`.
 
