@@ -102,7 +102,8 @@ class MujocoPhysics:
 
     def step(self, ctrl: Tensor) -> None:
         self._ctrl[:] = ctrl.numpy()
-        forces, largest = None, None
+        forces = np.zeros_like(self._forces)
+        largest = np.full(forces.shape[:2], -1.0)
         for i in range(self.scene.substeps):
             last = i == self.scene.substeps - 1
             if self._timesteps is not None:
@@ -112,12 +113,9 @@ class MujocoPhysics:
                 self._keep_momentum(i, last)
             now = self._sensors.reshape(self.num_worlds, -1, 3)[:, : self._forces.shape[1]]
             norm = np.einsum("nsi,nsi->ns", now, now)
-            if forces is None:
-                forces, largest = now.copy(), norm
-            else:
-                more = norm > largest
-                np.copyto(forces, now, where=more[:, :, None])
-                np.copyto(largest, norm, where=more)
+            more = norm > largest
+            np.copyto(forces, now, where=more[:, :, None])
+            np.copyto(largest, norm, where=more)
         self._forces = np.nan_to_num(forces)
         with np.errstate(over="ignore", invalid="ignore"):  # diverged worlds, found just below
             self._read()
