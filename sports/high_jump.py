@@ -6,9 +6,11 @@ SMPLOlympics section 4 for the goal and reward; World Athletics technical rules 
 (2.0 kg; a trial fails when the bar does not stay on).
 
 The height term pays for *new* ground gained over the bar, so that standing there earns nothing;
-at 3 m/s it equals the paper's. Beyond the paper's terms a jump that counts earns ``CLEARED`` once:
-without it nothing is paid for leaving the bar on, and PPO (93 M samples) somersaulted 5 m over a
-1.5 m bar and out of the field in 94 % of its trials, or at human strength ran through the bar.
+at 3 m/s it equals the paper's. Beyond the paper's terms a jump that counts earns
+``HighJump.cleared`` once: without it nothing is paid for leaving the bar on, and PPO (93 M samples)
+somersaulted 5 m over a 1.5 m bar and out of the field in 94 % of its trials, or at human strength
+ran through the bar. The height term pays about 10 for each metre of the root's height over the bar,
+so the prize must be worth several of them.
 """
 
 from __future__ import annotations
@@ -34,8 +36,6 @@ EVALUATION_HEIGHTS = (1.0, 1.5)
 HOLD_STEPS = 15
 """Steps the bar must stay on after the first ground contact beyond it."""
 STALL_STEPS, STALL_SPEED = 15, 0.1
-CLEARED = 10.0
-"""Reward of a jump that counts, once: about the height term of an ordinary one."""
 MAX_DROP, MAX_SHIFT, MAX_PUSH = 0.05, 0.10, 50.0
 
 # Each upright holds the bar in a shallow groove of two balls; about 9 N sideways lifts it out.
@@ -54,11 +54,22 @@ class HighJump:
     """Height of the bar's top (m). None: the curriculum in training, 1.0 m and 1.5 m in turn in
     evaluation."""
     curriculum: bool = True
-    """Raise each world's bar on success (0.5, 1.0, 1.5, 2.0 m). False: 1.5 m from the start."""
+    """Raise each world's bar on success. False: 1.5 m from the start."""
+    levels: tuple[float, ...] = HEIGHTS
+    """Heights of the curriculum (m), rising. A weak athlete needs smaller steps."""
+    cleared: float = 50.0
+    """Reward of a jump that counts, once; 0 for the paper's terms alone."""
 
     def __post_init__(self) -> None:
-        if self.bar_height is not None and not 0.1 <= self.bar_height <= 3.0:
-            raise ValueError(f"bar_height must be between 0.1 and 3.0 m, not {self.bar_height}")
+        object.__setattr__(self, "levels", tuple(self.levels))  # JSON gives lists
+        heights = self.levels if self.bar_height is None else (*self.levels, self.bar_height)
+        for height in heights:
+            if not 0.1 <= height <= 3.0:
+                raise ValueError(f"a bar must be between 0.1 and 3.0 m high, not {height}")
+        if not self.levels or list(self.levels) != sorted(set(self.levels)):
+            raise ValueError(f"the levels must rise, not be {self.levels}")
+        if self.cleared < 0.0:
+            raise ValueError(f"the prize for a cleared bar must not be negative: {self.cleared}")
 
 
 def scene(config: HighJump, body: Body) -> Scene:
@@ -98,7 +109,7 @@ def scene(config: HighJump, body: Body) -> Scene:
 
 
 def curriculum(config: HighJump, num_worlds: int, device: torch.device) -> Memory:
-    """Each world's level: an index into ``HEIGHTS``."""
+    """Each world's level: an index into ``config.levels``."""
     return {"level": torch.zeros(num_worlds, dtype=torch.long, device=device)}
 
 
@@ -106,10 +117,10 @@ def promote(view: View, memory: Memory, step: Advance, ended: Tensor) -> Memory:
     """One level up for a world that cleared the bar of its level from the standing start: a
     demonstration's flight is no proof that the world can get there by itself."""
     level = view.curriculum["level"]
-    heights = constant(HEIGHTS, level.device)
+    heights = constant(view.config.levels, level.device)
     at_level = memory["bar_height"] >= heights[level] - 1e-4
     up = ended & step.success & at_level & memory["standing"]
-    return {"level": (level + up.long()).clamp(max=len(HEIGHTS) - 1)}
+    return {"level": (level + up.long()).clamp(max=heights.shape[0] - 1)}
 
 
 def _heights(view: View, n: int, generator: torch.Generator, training: bool) -> Tensor:
@@ -121,12 +132,13 @@ def _heights(view: View, n: int, generator: torch.Generator, training: bool) -> 
         turn = torch.arange(n, device=device) % len(EVALUATION_HEIGHTS)
         return constant(EVALUATION_HEIGHTS, device)[turn]
     if not config.curriculum:
-        return torch.full((n,), HEIGHTS[2], device=device)
+        return torch.full((n,), EVALUATION_HEIGHTS[-1], device=device)
     # Half of the episodes at the world's own level, half at any it has reached: none forgotten.
     level = view.curriculum["level"]
     draw = torch.rand(n, 2, device=device, generator=generator)
-    lower = (draw[:, 1] * (level + 1)).long().clamp(max=len(HEIGHTS) - 1)
-    return constant(HEIGHTS, device)[torch.where(draw[:, 0] < 0.5, level, lower)]
+    lower = (draw[:, 1] * (level + 1)).long()
+    lower = torch.minimum(lower, level)
+    return constant(config.levels, device)[torch.where(draw[:, 0] < 0.5, level, lower)]
 
 
 def start(
@@ -226,7 +238,7 @@ def advance(view: View, memory: Memory) -> Advance:
     failed = displaced | wrong_side | outside | fell | (stalled >= STALL_STEPS)
     success = (landed > HOLD_STEPS) & ~failed
 
-    terms["cleared"] = CLEARED * success
+    terms["cleared"] = view.config.cleared * success
     near = (x - BAR_X).abs() < 0.1
     height_sum = memory["height_sum"] + z * near
     height_count = memory["height_count"] + near

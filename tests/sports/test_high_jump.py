@@ -5,7 +5,9 @@ import math
 import pytest
 import torch
 
+from sports.env import make_env
 from sports.high_jump import HEIGHTS
+from sports.registry import get_task, make_config
 from tests.sports.hand_made import HandMade
 
 HIGH = 1.9  # root height at which the whole T-pose is above a 1 m bar
@@ -32,7 +34,7 @@ def test_clearing_landing_and_waiting_is_a_success():
     steps = [world.advance({"L_Toe": 800.0}) for _ in range(16)]
     assert [bool(s.terminated[0]) for s in steps] == [False] * 15 + [True]
     assert steps[-1].success[0]
-    assert [float(s.terms["cleared"][0, 0]) for s in steps] == [0.0] * 15 + [10.0]
+    assert [float(s.terms["cleared"][0, 0]) for s in steps] == [0.0] * 15 + [50.0]
     assert steps[-1].metrics["height"][0] == pytest.approx(HIGH, abs=1e-5)
 
 
@@ -163,6 +165,24 @@ def test_worlds_are_promoted_only_by_clearing_their_own_level():
     levels = env.task.promote(env.view, env.memory, step, torch.ones(4, dtype=torch.bool))
     assert levels["level"].tolist() == [2, 2, 1, 1]
     assert HEIGHTS == (0.5, 1.0, 1.5, 2.0)
+    env.view.curriculum = {"level": torch.tensor([3, 3, 3, 3])}
+    step.success[:] = True
+    env.memory["bar_height"][:] = 2.0
+    top = env.task.promote(env.view, env.memory, step, torch.ones(4, dtype=torch.bool))
+    assert top["level"].tolist() == [3, 3, 3, 3]
+
+
+def test_levels_of_ones_own():
+    env = make_env("high_jump", num_worlds=64, options={"levels": [0.4, 0.6, 0.9]})
+    env.view.curriculum = {"level": torch.full((64,), 2)}
+    env.reset()
+    drawn = env.memory["bar_height"].unique().tolist()
+    assert drawn == pytest.approx([0.4, 0.6, 0.9])
+    for bad in ([], [0.9, 0.6], [0.5, 0.5], [0.0], [9.0]):
+        with pytest.raises(ValueError, match="bar must be|levels must rise"):
+            make_config(get_task("high_jump"), {"levels": bad})
+    with pytest.raises(ValueError, match="not be negative"):
+        make_config(get_task("high_jump"), {"cleared": -1.0})
 
 
 def test_the_bar_rests_on_its_uprights_for_three_seconds():
