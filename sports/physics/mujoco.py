@@ -15,7 +15,7 @@ from torch import Tensor
 from sports.humanoid.mjcf import body_name, build_model
 from sports.physics.base import Geometry, PhysicsState, default_state, diverged
 from sports.physics.momentum import MomentumKeeper, Tree
-from sports.physics.variation import Draw, Variation, draw
+from sports.physics.variation import Draw, Variation, contact_softness, draw
 from sports.quaternion import cross
 from sports.scene import Scene
 
@@ -88,7 +88,7 @@ class MujocoPhysics:
         """Gives each world its own numbers; see the ``warp`` engine."""
         expand = self.batch.expand
         expand("geom_friction")[:, :, 0] *= drawn.friction[:, None]
-        expand("geom_solref")[:, :, 0] = drawn.contact_time[:, None]
+        expand("geom_solref")[:] = contact_softness(self.model.geom_solref, drawn)
         expand("actuator_gainprm")[:, :, 0] *= drawn.stiffness[:, None]
         expand("actuator_biasprm")[:, :, 1] *= drawn.stiffness[:, None]
         damping = expand("dof_damping")
