@@ -162,13 +162,20 @@ class Geometry:
         return self.radii[self.padded]
 
     def link_points(self, body_pos: Tensor, rotation: Tensor) -> Tensor:
-        """(..., B, K', 3) support points in the world, by link and padded by repetition to the
+        """(N, ..., B, K', 3) support points in the world, by link and padded by repetition to the
         link with most; the balls around them have ``link_radii`` (B, K'). ``rotation`` is R_WB
-        (..., B, 3, 3)."""
-        # Written out: a batch of tiny matrix products is slow on a CPU.
-        x, y, z = rotation[..., None, :, :].unbind(-1)  # columns, (..., B, 1, 3)
+        (N, ..., B, 3, 3)."""
+        # By coordinate and with the worlds in the last axis: rows of three numbers, and tiny
+        # matrix products, are slow on a CPU.
+        turn, origin = rotation.movedim((-2, -1, 0), (0, 1, -1)), body_pos.movedim((-1, 0), (0, -1))
         px, py, pz = self._padded_points[..., None].unbind(-2)  # (B, K', 1)
-        return body_pos[..., None, :] + x * px + y * py + z * pz
+        along = [
+            torch.addcmul(origin[i][..., None, :], turn[i, 0][..., None, :], px)
+            .addcmul_(turn[i, 1][..., None, :], py)
+            .addcmul_(turn[i, 2][..., None, :], pz)
+            for i in range(3)
+        ]
+        return torch.stack(along).movedim((0, -1), (-1, 0))
 
     @property
     def link_radii(self) -> Tensor:
@@ -189,11 +196,13 @@ class Geometry:
         """
         if rotation is None:
             rotation = quaternion.matrix(physics.body_quat[:, agent])
-        arm = (rotation @ self.center[..., None])[..., 0]  # (N, B, 3)
-        share = self.mass / self.mass.sum()
+        x, y, z = rotation.unbind(-1)
+        cx, cy, cz = self.center[..., None].unbind(-2)
+        arm = x * cx + y * cy + z * cz  # (N, B, 3)
+        share = (self.mass / self.mass.sum())[:, None]
         spin = quaternion.cross(physics.body_angvel[:, agent], arm)
-        position = share @ (physics.body_pos[:, agent] + arm)
-        return position, share @ (physics.body_linvel[:, agent] + spin)
+        position = (share * (physics.body_pos[:, agent] + arm)).sum(1)
+        return position, (share * (physics.body_linvel[:, agent] + spin)).sum(1)
 
     def extent(self, body_pos: Tensor, body_quat: Tensor, direction: Tensor) -> Tensor:
         """(..., B) furthest reach along unit ``direction`` (3,) of each link, m."""
@@ -209,8 +218,6 @@ SPEED_LIMIT = 2000.0
 
 def diverged(qpos: Tensor, qvel: Tensor) -> Tensor:
     """(N,) worlds whose numbers are not finite or beyond any athlete or bar."""
-    return ~(
-        torch.isfinite(qpos).all(-1)
-        & torch.isfinite(qvel).all(-1)
-        & (qvel.abs().amax(-1) < SPEED_LIMIT)
-    )
+    # NaN is the largest of all, and not below any bound.
+    furthest, fastest = qpos.abs().amax(-1), qvel.abs().amax(-1)
+    return ~((furthest < torch.inf) & (fastest < SPEED_LIMIT))

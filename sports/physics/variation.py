@@ -7,7 +7,7 @@ training each world may have its own friction, gains, contact softness and time 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -47,6 +47,10 @@ class Draw:
     contact_time: np.ndarray
     coarse: np.ndarray
     """bool"""
+
+    def of(self, worlds: slice) -> Draw:
+        """That of some worlds."""
+        return Draw(*(getattr(self, field.name)[worlds] for field in fields(self)))
 
 
 def draw(variation: Variation, num_worlds: int, substeps: int, seed: int) -> Draw:
