@@ -45,15 +45,13 @@ def proprioception_slices(num_links: int) -> dict[str, slice]:
     return slices
 
 
-def proprioception(physics: Physics, heading: Heading, rotation: Tensor | None = None) -> Tensor:
+def proprioception(physics: Physics, heading: Heading) -> Tensor:
     """(N, A, 15 B - 2) what an athlete feels of its own body: SMPL 358, SMPL-X 778.
 
     Order: root height; link positions relative to the root; link rotations in 6-D (first two
     columns of the rotation matrix, Zhou et al. 2019); linear and angular velocities; all but
-    the height in the heading frame. ``rotation``: R_WB (N, A, B, 3, 3), where it is at hand.
+    the height in the heading frame.
     """
-    if rotation is None:
-        rotation = quaternion.matrix(physics.body_quat)
     n, a, b = physics.body_pos.shape[:3]
     root = physics.body_pos[:, :, :1]
     # A row for each number, over the worlds: long rows are quick on a CPU.
@@ -61,7 +59,7 @@ def proprioception(physics: Physics, heading: Heading, rotation: Tensor | None =
     rows[:, 0] = root[:, :, 0, 2].T
     parts = (
         physics.body_pos[:, :, 1:] - root,
-        rotation.transpose(-1, -2)[:, :, :, :2],
+        physics.body_rot.transpose(-1, -2)[:, :, :, :2],
         physics.body_linvel,
         physics.body_angvel,
     )

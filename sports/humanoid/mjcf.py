@@ -189,19 +189,6 @@ def build_model(scene: Scene | Body, sensors: bool = True) -> mujoco.MjModel:
     return model
 
 
-def build_kinematics(scene: Scene) -> mujoco.MjModel:
-    """The scene's bodies and joints without contacts and forces: all that positions, velocities
-    and momentum need. Its velocity stage costs a third of the full model's."""
-    spec = build_spec(scene)
-    for sensor in list(spec.sensors):
-        if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT:
-            spec.delete(sensor)
-    off = ("CONTACT", "CONSTRAINT", "ACTUATION", "SPRING", "DAMPER", "GRAVITY")
-    for name in off:
-        spec.option.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
-    return spec.compile()
-
-
 def dof_order(model: mujoco.MjModel) -> list[str]:
     """Names of the hinge joints in ``qpos`` order, agent prefix dropped, for parity tables."""
     return [

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -44,6 +44,8 @@ class Physics(Protocol):
     scene: Scene
     num_worlds: int
     device: torch.device
+    geometry: Geometry
+    """Support points of the scene's body."""
 
     qpos: Tensor
     """(N, nq)"""
@@ -55,6 +57,8 @@ class Physics(Protocol):
     """(N, A, B, 3) link origins p_WB."""
     body_quat: Tensor
     """(N, A, B, 4) link rotations R_WB."""
+    body_rot: Tensor
+    """(N, A, B, 3, 3) the same as matrices."""
     body_linvel: Tensor
     """(N, A, B, 3) velocity of the link origins, world frame."""
     body_angvel: Tensor
@@ -99,6 +103,30 @@ class Physics(Protocol):
     def close(self) -> None:
         """Frees threads and device memory."""
         ...
+
+
+class SomeWorlds:
+    """Some worlds of an engine, by index: copies of its tensors' rows, to look at."""
+
+    def __init__(self, physics: Physics, worlds: Tensor) -> None:
+        self._physics, self._worlds = physics, worlds
+        self.num_worlds = worlds.shape[0]
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._physics, name)
+        if isinstance(value, Tensor) and value.dim() > 0:
+            value = value[self._worlds]
+            setattr(self, name, value)
+        return value
+
+    def extent(self, direction: Tensor) -> Tensor:
+        return self._physics.extent(direction)[self._worlds]
+
+    def step(self, ctrl: Tensor) -> None:
+        raise NotImplementedError("only the whole engine can step")
+
+    def reset(self, mask: Tensor, state: PhysicsState) -> None:
+        raise NotImplementedError("only the whole engine can reset")
 
 
 def default_state(scene: Scene, num_worlds: int, device: torch.device | str) -> PhysicsState:
@@ -195,7 +223,7 @@ class Geometry:
         ``rotation``: R_WB of the agent's links (N, B, 3, 3), where it is at hand.
         """
         if rotation is None:
-            rotation = quaternion.matrix(physics.body_quat[:, agent])
+            rotation = physics.body_rot[:, agent]
         x, y, z = rotation.unbind(-1)
         cx, cy, cz = self.center[..., None].unbind(-2)
         arm = x * cx + y * cy + z * cz  # (N, B, 3)

@@ -167,28 +167,15 @@ class AthleteKeeper:
 
     Call :meth:`correct` after every single substep: with ``current`` false after a plain
     ``batch.step()`` or ``mj_step``; with ``current`` true after the last substep before the links
-    are read, when the fields show the state it led to. They do after ``batch.step(stage=
-    mjSTAGE_VEL)`` (or ``mj_step``, ``mj_step1``), or in a second batch that only moves::
-
-        motion = Batch(build_kinematics(scene), nsim)  # three times as quick
-        keeper = AthleteKeeper(model, batch.bind, root, after=(motion.model, motion.bind))
-        batch.step()
-        motion.bind("qpos")[:], motion.bind("qvel")[:] = batch.bind("qpos"), batch.bind("qvel")
-        motion.forward(stage=mjSTAGE_VEL)
-        keeper.correct(current=True)
-
-    It writes ``qpos`` and ``qvel`` of the simulation. Links read after a ``current`` correction
-    were computed before it: add the returned shift to their positions, the twist to ``cvel``.
-    Call :meth:`forget` for simulations whose state was set from outside.
+    are read, when the fields show the state that it led to, as they do after
+    ``batch.step(stage=mjSTAGE_VEL)`` or ``mj_step`` and ``mj_step1``. It writes ``qpos`` and
+    ``qvel``. Links read after a ``current`` correction were computed before it: add the returned
+    shift to their positions, the twist to ``cvel``. Call :meth:`forget` for simulations whose
+    state was set from outside.
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        bind: Bind,
-        root: str,
-        num_worlds: int | None = None,
-        after: tuple[mujoco.MjModel, Bind] | None = None,
+        self, model: mujoco.MjModel, bind: Bind, root: str, num_worlds: int | None = None
     ) -> None:
         """
         Args:
@@ -196,19 +183,29 @@ class AthleteKeeper:
             bind: gives a live (N, ...) array of an MjData field; ``Batch.bind`` or ``rows_of``.
             root: name of the athlete's root body, the one with the free joint.
             num_worlds: keep the first so many simulations; None for all.
-            after: model and fields that ``current`` corrections look at; None for the same.
 
         Raises:
-            ValueError: a model lacks the athlete's momentum sensors.
+            ValueError: the model lacks the athlete's momentum sensors.
         """
-        n = slice(num_worlds)
-        body = model.body(root)
+        names = [model.sensor(i).name for i in range(model.nsensor)]
+        for name in (f"angmom:{root}", f"linvel:{root}"):
+            if name not in names:
+                raise ValueError(f"the model has no sensor '{name}'; see sports.humanoid.mjcf")
+        n, body = slice(num_worlds), model.body(root)
         q, v = model.jnt_qposadr[body.jntadr[0]], model.jnt_dofadr[body.jntadr[0]]
+        spin, speed = (model.sensor(f"{k}:{root}").adr[0] for k in ("angmom", "linvel"))
+        sensors = bind("sensordata")
         self._pos, self._vel = bind("qpos")[n, q : q + 3], bind("qvel")[n, v : v + 6]
-        force = bind("qfrc_constraint")[n, v : v + 6]
-        self._before = self._after = _tree(model, bind, root, n, force)
-        if after is not None:
-            self._after = _tree(*after, root, n, force)
+        self.tree = Tree(
+            inertia=bind("crb")[n, body.id, :6],
+            angular=sensors[n, spin : spin + 3],
+            velocity=sensors[n, speed : speed + 3],
+            com=bind("subtree_com")[n, body.id],
+            root_pos=bind("xpos")[n, body.id],
+            root_quat=bind("xquat")[n, body.id],
+            root_force=bind("qfrc_constraint")[n, v : v + 6],
+        )
+        """What the fields show; live."""
         mass = float(model.body_subtreemass[body.id])
         self.expected = MomentumKeeper(len(self._pos), mass, model.opt.timestep)
         """The momentum and the path expected, and the time step."""
@@ -218,9 +215,9 @@ class AthleteKeeper:
         self.expected.forget(worlds)
 
     def measured(self) -> np.ndarray:
-        """(N, 9) as the fields of ``current`` corrections show it: centre of mass (m), its velocity
-        (m/s), angular momentum about it (N m s); world frame. They must be up to date."""
-        tree = self._after
+        """(N, 9) as the fields show it: centre of mass (m), its velocity (m/s), angular momentum
+        about it (N m s); world frame. The fields must be current, as after ``mj_forward``."""
+        tree = self.tree
         return np.concatenate((tree.com, tree.velocity, tree.angular), axis=1)
 
     def whole(self) -> np.ndarray:
@@ -230,37 +227,21 @@ class AthleteKeeper:
         speed = momentum[:, 3:] / self.expected.mass
         return np.concatenate((self.expected.path, speed, momentum[:, :3]), axis=1)
 
-    def correct(self, current: bool) -> tuple[np.ndarray, np.ndarray]:
+    def correct(self, current: bool, after: Tree | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Corrects the state after a substep; see the class.
+
+        ``after``: the athlete after the substep, for a ``current`` correction where the model's
+        fields do not show it.
 
         Returns (N, 6) the added spatial velocity (rotation, then velocity of the centre of mass,
         as ``cvel``; world) and (N, 3) the shift of the whole athlete.
         """
-        tree = self._after if current else self._before
+        tree = after or self.tree
         with np.errstate(all="ignore"):  # a simulation may have diverged
             twist, change, shift = self.expected.correct(tree, current)
             self._vel += change
             self._pos += shift
         return twist, shift
-
-
-def _tree(model: mujoco.MjModel, bind: Bind, root: str, n: slice, root_force: np.ndarray) -> Tree:
-    """Views of the fields that show an athlete."""
-    names = [model.sensor(i).name for i in range(model.nsensor)]
-    for name in (f"angmom:{root}", f"linvel:{root}"):
-        if name not in names:
-            raise ValueError(f"the model has no sensor '{name}'; see sports.humanoid.mjcf")
-    body, sensors = model.body(root).id, bind("sensordata")
-    spin, speed = (model.sensor(f"{k}:{root}").adr[0] for k in ("angmom", "linvel"))
-    return Tree(
-        inertia=bind("crb")[n, body, :6],
-        angular=sensors[n, spin : spin + 3],
-        velocity=sensors[n, speed : speed + 3],
-        com=bind("subtree_com")[n, body],
-        root_pos=bind("xpos")[n, body],
-        root_quat=bind("xquat")[n, body],
-        root_force=root_force,
-    )
 
 
 def rows_of(data: mujoco.MjData) -> Bind:

@@ -14,8 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sports.humanoid.mjcf import build_kinematics, build_model
+from sports.humanoid.mjcf import build_model
 from sports.physics.base import Geometry, PhysicsState, default_state, diverged
+from sports.physics.kinematics import Kinematics
 from sports.physics.variation import Variation, draw
 from sports.physics.worlds import Motion, Results, Worlds
 from sports.scene import Scene
@@ -40,7 +41,7 @@ class MujocoPhysics:
         self.threads = threads = threads or os.cpu_count() or 1
         self.device = torch.device("cpu")
         self.model = model = build_model(scene)
-        kinematics = build_kinematics(scene)
+        kinematics = Kinematics(model, scene.body)
         self.geometry = Geometry(scene.body, self.device)
         out = Results.zeros(scene, n)
         drawn = None
@@ -55,6 +56,7 @@ class MujocoPhysics:
         self.qpos, self.qvel = torch.from_numpy(out.qpos), torch.from_numpy(out.qvel)
         self.mocap_pos = torch.from_numpy(out.mocap_pos)
         self.body_pos, self.body_quat, self.body_linvel, self.body_angvel = _tensors(out.links)
+        self.body_rot = torch.from_numpy(out.rotation).permute(4, 2, 3, 0, 1)
         self.object_pos, self.object_quat, self.object_linvel, self.object_angvel = _tensors(
             out.objects
         )

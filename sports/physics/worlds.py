@@ -1,9 +1,8 @@
 """Worlds of C MuJoCo on native threads: what one thread of the ``mujoco`` engine drives.
 
-A control step is ``substeps`` calls of a batch, the momentum kept after each. Where the links are
-afterwards is computed by a second batch that knows neither contacts nor forces: that takes a third
-of the time of asking the first. Results go into float32 arrays with the components first and the
-worlds last: an operation on one component then runs over all links and worlds at once.
+A control step is ``substeps`` calls of a batch, the momentum kept after each. Results go into
+float32 arrays with the components first and the worlds last: an operation on one component then
+runs over all links and worlds at once.
 """
 
 from __future__ import annotations
@@ -15,12 +14,12 @@ import numpy as np
 from mujoco.batch import Batch
 
 from sports.humanoid.mjcf import body_name
-from sports.physics.momentum import AthleteKeeper
+from sports.physics.kinematics import Kinematics, Pose, cross, rotation
+from sports.physics.momentum import AthleteKeeper, Tree
 from sports.physics.variation import Draw
 from sports.scene import Scene
 
 Rows = slice | np.ndarray
-_VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 _ALL = slice(None)
 
 
@@ -59,6 +58,8 @@ class Results:
     """(N, M, 3)"""
     links: Motion
     """(A, B, N)"""
+    rotation: np.ndarray
+    """(3, 3, A, B, N) R_WB of the links."""
     objects: Motion
     """(O, N)"""
     ground_force: np.ndarray
@@ -75,6 +76,7 @@ class Results:
             qvel=np.zeros((n, scene.nv), np.float32),
             mocap_pos=np.zeros((n, len(scene.mocap_objects), 3), np.float32),
             links=Motion.zeros(agents, links, n),
+            rotation=np.zeros((3, 3, agents, links, n), np.float32),
             objects=Motion.zeros(len(scene.free_objects), n),
             ground_force=np.zeros((3, agents * links, n), np.float32),
             pair_force=np.zeros((3, len(scene.contact_pairs), n), np.float32),
@@ -87,6 +89,7 @@ class Results:
             self.qvel[worlds],
             self.mocap_pos[worlds],
             self.links.of(worlds),
+            self.rotation[..., worlds],
             self.objects.of(worlds),
             self.ground_force[..., worlds],
             self.pair_force[..., worlds],
@@ -100,32 +103,23 @@ class Worlds:
         self,
         scene: Scene,
         model: mujoco.MjModel,
-        kinematics: mujoco.MjModel,
+        kinematics: Kinematics,
         threads: int,
         out: Results,
         drawn: Draw | None = None,
     ) -> None:
-        """``model`` and ``kinematics`` of ``mjcf``; ``drawn``: what makes the worlds differ."""
-        self.scene, self.out = scene, out
-        n, agents = len(out.qpos), scene.num_agents
+        """``model`` of ``mjcf``; ``drawn``: what makes the worlds differ."""
+        self.scene, self.out, self._kinematics = scene, out, kinematics
+        n, body = len(out.qpos), scene.body
         self.batch = batch = Batch(model, nsim=n, nthread=threads)
-        self._motion = motion = Batch(kinematics, nsim=n, nthread=threads)
         self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
         self.warmstart, self._ctrl = batch.bind("qacc_warmstart"), batch.bind("ctrl")
         self._mocap = batch.bind("mocap_pos") if model.nmocap else None
         self._mocap_rows = [model.body(o.name).mocapid[0] for o in scene.mocap_objects]
-        roots = [body_name(a, scene.body.link_names[0]) for a in range(agents)]
-        after = (kinematics, motion.bind)
-        self.keepers = [AthleteKeeper(model, batch.bind, root, after=after) for root in roots]
-        self._twist, self._shift = np.zeros((6, agents, n)), np.zeros((3, agents, n))
-        links = [
-            [model.body(body_name(a, link)).id for link in scene.body.link_names]
-            for a in range(agents)
+        self.keepers = [
+            AthleteKeeper(model, batch.bind, body_name(agent, body.link_names[0]))
+            for agent in range(scene.num_agents)
         ]
-        objects = [model.body(o.name).id for o in scene.free_objects]
-        root_ids = model.body_rootid
-        self._links = _Reader(motion, np.array(links), root_ids[links][:, :1], out.links)
-        self._objects = _Reader(motion, np.array(objects, int), root_ids[objects], out.objects)
         split = out.ground_force.shape[1]
         forces = batch.bind("sensordata")[:, : 3 * (split + out.pair_force.shape[1])]
         forces = forces.reshape(n, -1, 3)
@@ -156,12 +150,10 @@ class Worlds:
                 if i < self.scene.substeps - 1:
                     for keeper in self.keepers:
                         keeper.correct(current=False)
-        self._move(None)
-        for agent, keeper in enumerate(self.keepers):
-            twist, shift = keeper.correct(current=True)
-            self._twist[:, agent], self._shift[:, agent] = twist.T, shift.T
         with np.errstate(all="ignore"):
-            self._read(_ALL)
+            for agent, keeper in enumerate(self.keepers):
+                self._finish(agent, keeper)
+            self._show_rest(_ALL)
 
     def reset(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
         """Puts worlds ``ids`` into states (len(ids), ...)."""
@@ -206,68 +198,60 @@ class Worlds:
             none = np.where(drawn.coarse, 0.0, h)
             self._timesteps = [none if i % 2 else double for i in range(self.scene.substeps)]
 
-    def _move(self, ids: np.ndarray | None) -> None:
-        """Computes where the bodies are, and how they move, from the state."""
-        rows = _ALL if ids is None else ids
-        self._motion.bind("qpos")[rows] = self.qpos[rows]
-        self._motion.bind("qvel")[rows] = self.qvel[rows]
-        self._motion.forward(ids=ids, stage=_VEL)
+    def _finish(self, agent: int, keeper: AthleteKeeper) -> None:
+        """Corrects an athlete's momentum after the last substep and shows its links."""
+        qpos = self.qpos[:, self.scene.agent_qpos(agent)]
+        pose = self._kinematics.pose(qpos, self.qvel[:, self.scene.agent_qvel(agent)])
+        whole = self._kinematics.whole(pose)
+        after = Tree(
+            inertia=whole.inertia.T,
+            angular=whole.angular.T,
+            velocity=whole.velocity.T,
+            com=qpos[:, :3] + whole.com.T,
+            root_pos=qpos[:, :3],
+            root_quat=qpos[:, 3:7],
+            root_force=keeper.tree.root_force,
+        )
+        twist, _ = keeper.correct(True, after)
+        # The pose is of the velocities before the correction, which moves the athlete as a whole.
+        turn, speed = np.split(np.array(twist.T, np.float32, order="C"), 2)
+        pose.spin[:] += turn[:, None]
+        pose.velocity[:] += speed[:, None] + cross(turn[:, None], pose.pos - whole.com[:, None])
+        self._show_athlete(agent, _ALL, pose)
 
     def _show(self, rows: Rows) -> None:
         """Shows a state that was set from outside."""
-        self._twist[..., rows], self._shift[..., rows] = 0.0, 0.0
-        self._move(None if isinstance(rows, slice) else rows)
         with np.errstate(all="ignore"):
-            self._read(rows)
+            for agent in range(self.scene.num_agents):
+                qpos = self.qpos[rows, self.scene.agent_qpos(agent)]
+                pose = self._kinematics.pose(qpos, self.qvel[rows, self.scene.agent_qvel(agent)])
+                self._show_athlete(agent, rows, pose)
+            self._show_rest(rows)
 
-    def _read(self, rows: Rows) -> None:
-        out = self.out
+    def _show_athlete(self, agent: int, rows: Rows, pose: Pose) -> None:
+        links, order = self.out.links, self._kinematics.table
+        root = self.qpos[rows, self.scene.agent_qpos(agent)][:, :3].T
+        links.pos[:, agent][..., rows] = pose.pos[:, order] + root[:, None]
+        links.quat[:, agent][..., rows] = pose.quat[:, order]
+        links.linvel[:, agent][..., rows] = pose.velocity[:, order]
+        links.angvel[:, agent][..., rows] = pose.spin[:, order]
+        self.out.rotation[:, :, agent][..., rows] = pose.rot[:, :, order]
+
+    def _show_rest(self, rows: Rows) -> None:
+        """The state itself, and the free objects."""
+        out, scene = self.out, self.scene
         out.qpos[rows], out.qvel[rows] = self.qpos[rows], self.qvel[rows]
         if self._mocap is not None:
             out.mocap_pos[rows] = self._mocap[rows][:, self._mocap_rows]
-        # The last substep's correction came after the links were computed.
-        self._links.read(rows, self._twist[:, :, None, rows], self._shift[:, :, None, rows])
-        if self.scene.free_objects:
-            self._objects.read(rows, 0.0, 0.0)
-
-
-class _Reader:
-    """Turns MuJoCo's float64 fields into a :class:`Motion`."""
-
-    def __init__(self, batch: Batch, ids: np.ndarray, roots: np.ndarray, out: Motion) -> None:
-        """``ids`` (...) of the bodies, ``roots`` of their trees, of a shape that broadcasts."""
-        self._roots, self._out = roots, out
-        self._shape, flat = ids.shape, ids.ravel()
-        self._ids: Rows = flat
-        if flat.size and np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
-            self._ids = slice(int(flat[0]), int(flat[0]) + flat.size)  # copies faster
-        self._pos, self._quat = batch.bind("xpos"), batch.bind("xquat")
-        self._cvel, self._com = batch.bind("cvel"), batch.bind("subtree_com")
-
-    def read(self, rows: Rows, twist: np.ndarray | float, shift: np.ndarray | float) -> None:
-        """``twist`` (6, ..., n) and ``shift`` (3, ..., n) are added to all that is read."""
-        where = self._take(self._pos, rows)
-        pos = np.array(where, np.float32, order="C")
-        # In float64, since the centre of mass is subtracted from positions far from the origin.
-        arm = np.empty_like(pos)
-        com = np.moveaxis(self._com[rows][:, self._roots], (-1, 0), (0, -1))
-        np.subtract(where, com, out=arm, casting="same_kind")
-        moving = np.array(self._take(self._cvel, rows), np.float32, order="C")
-        moving += twist
-        pos += shift
-        # cvel is taken at the centre of mass of the kinematic tree; move it to the link origin.
-        (p, q, r), (x, y, z), lin = moving[:3], arm, moving[3:]
-        lin[0] += q * z - r * y
-        lin[1] += r * x - p * z
-        lin[2] += p * y - q * x
-        out = self._out
-        out.pos[..., rows], out.quat[..., rows] = pos, self._take(self._quat, rows)
-        out.linvel[..., rows], out.angvel[..., rows] = lin, moving[:3]
-
-    def _take(self, field: np.ndarray, rows: Rows) -> np.ndarray:
-        """(k, ..., n) components first, worlds last."""
-        taken = field[rows][:, self._ids].T
-        return taken.reshape(taken.shape[0], *self._shape, taken.shape[2])
+        for k, o in enumerate(scene.free_objects):
+            pos, quat = np.split(self.qpos[rows, scene.object_qpos(o.name)].T, [3])
+            linear, (x, y, z) = np.split(self.qvel[rows, scene.object_qvel(o.name)].T, 2)
+            quat = quat / np.sqrt((quat * quat).sum(0))
+            turn = rotation(quat)
+            out.objects.pos[:, k][:, rows], out.objects.quat[:, k][:, rows] = pos, quat
+            out.objects.linvel[:, k][:, rows] = linear
+            spin = turn[:, 0] * x + turn[:, 1] * y + turn[:, 2] * z
+            out.objects.angvel[:, k][:, rows] = spin
 
 
 class _Peak:
