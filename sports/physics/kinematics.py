@@ -19,6 +19,7 @@ import numpy as np
 
 from sports.humanoid.body import Body
 from sports.humanoid.mjcf import body_name
+from sports.physics.vectors import cross, rotation
 
 # The product of quaternions a b is the sum over k of a[k] * _SIGN[k] * b[_PART[k]].
 _PART = np.array(((0, 1, 2, 3), (1, 0, 3, 2), (2, 3, 0, 1), (3, 2, 1, 0)))
@@ -172,27 +173,3 @@ class Kinematics:
 def _columns(values: np.ndarray) -> np.ndarray:
     """(3, B, 1) float32 of (B, 3)."""
     return np.array(values.T[..., None], np.float32, order="C")
-
-
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(3, ...) cross product; ``a`` broadcasts to ``b``."""
-    out = np.empty_like(b)
-    (x, y, z), (u, v, w) = a, b
-    out[0] = y * w - z * v
-    out[1] = z * u - x * w
-    out[2] = x * v - y * u
-    return out
-
-
-def rotation(quat: np.ndarray) -> np.ndarray:
-    """(3, 3, ...) matrices of unit quaternions (4, ...)."""
-    w, x, y, z = quat
-    x2, y2, z2 = x + x, y + y, z + z
-    xx, yy, zz = x * x2, y * y2, z * z2
-    xy, xz, yz = x * y2, x * z2, y * z2
-    wx, wy, wz = w * x2, w * y2, w * z2
-    out = np.empty((3, 3, *quat.shape[1:]), quat.dtype)
-    out[0, 0], out[0, 1], out[0, 2] = 1 - (yy + zz), xy - wz, xz + wy
-    out[1, 0], out[1, 1], out[1, 2] = xy + wz, 1 - (xx + zz), yz - wx
-    out[2, 0], out[2, 1], out[2, 2] = xz - wy, yz + wx, 1 - (xx + yy)
-    return out

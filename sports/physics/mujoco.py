@@ -17,8 +17,9 @@ from torch import Tensor
 from sports.humanoid.mjcf import build_model
 from sports.physics.base import Geometry, PhysicsState, default_state, diverged
 from sports.physics.kinematics import Kinematics
+from sports.physics.results import Display, Motion, Results
 from sports.physics.variation import Variation, draw
-from sports.physics.worlds import Motion, Results, Worlds
+from sports.physics.worlds import Worlds
 from sports.scene import Scene
 
 
@@ -47,6 +48,7 @@ class MujocoPhysics:
         drawn = None
         if variation is not None:
             drawn = draw(variation, n, scene.substeps, variation_seed)
+        self._out, self._display = out, Display(scene, kinematics, out)
         self._parts: list[tuple[slice, Worlds]] = []
         for rows, native in _share_out(n, threads):
             own = drawn.of(rows) if drawn is not None else None
@@ -81,11 +83,15 @@ class MujocoPhysics:
 
     def reset(self, mask: Tensor, state: PhysicsState) -> None:
         ids = np.flatnonzero(mask.numpy())
+        if not ids.size:
+            return
         qpos, qvel, mocap = state.qpos.numpy(), state.qvel.numpy(), state.mocap_pos.numpy()
         for rows, worlds in self._parts:
             own = ids[(ids >= rows.start) & (ids < rows.stop)]
-            if own.size:
-                worlds.reset(own - rows.start, qpos[own], qvel[own], mocap[own])
+            worlds.put(own - rows.start, qpos[own], qvel[own], mocap[own])
+        self._display.state(ids, qpos[ids], qvel[ids], mocap[ids])
+        self._out.ground_force[..., ids] = 0.0
+        self._out.pair_force[..., ids] = 0.0
         self.pair_force = self._pair_force.norm(dim=-1)
 
     def extent(self, direction: Tensor) -> Tensor:
