@@ -187,7 +187,7 @@ class Env:
         )
 
     def _reset(self, mask: Tensor) -> None:
-        context = self._place(mask)
+        context = self._place(mask, slice(None))
         fresh = self.task.begin(self.view, context)
         if not self.memory:
             self.memory = fresh
@@ -202,7 +202,7 @@ class Env:
         worlds = mask.nonzero()[:, 0]
         if worlds.shape[0] == 0:
             return obs
-        context = self._place(mask)
+        context = self._place(mask, worlds)
         view = self.view.of(worlds)
         fresh = self.task.begin(view, {k: v[worlds] for k, v in context.items()})
         self.memory = {
@@ -210,10 +210,11 @@ class Env:
         }
         return obs.index_copy(0, worlds, self._observe(view, fresh))
 
-    def _place(self, mask: Tensor) -> Memory:
-        """Puts the masked worlds at the start of an episode; the context of ``Task.begin``."""
+    def _place(self, mask: Tensor, rows: Tensor | slice) -> Memory:
+        """Puts the masked worlds at the start of an episode; the context of ``Task.begin``, with
+        what was drawn for ``rows``, which hold all of them."""
         state = self._default.clone()
-        context = self._draw_start(state)
+        context = self._draw_start(state, rows)
         state, context = self.task.start(self.view, state, context, self.generator, self.training)
         self.physics.reset(mask, state)
         self.view.clock = self.view.clock.masked_fill(mask, 0)
@@ -221,25 +222,35 @@ class Env:
         self.view.refresh()
         return context
 
-    def _draw_start(self, state: PhysicsState) -> Memory:
+    def _draw_start(self, state: PhysicsState, rows: Tensor | slice) -> Memory:
         """Joint noise, or a frame of a demonstration; labels are NaN for a standing start."""
-        scene, n = self.physics.scene, self.num_worlds
+        scene = self.physics.scene
+        n = self.num_worlds if isinstance(rows, slice) else rows.shape[0]
+
+        def draw(size: int) -> Tensor:
+            return torch.rand(n, size, device=self.device, generator=self.generator)
+
         if self.training:
             for agent in range(self.num_agents):
-                joints = state.qpos[:, scene.agent_qpos(agent)][:, 7:]
-                draw = torch.rand(joints.shape, device=self.device, generator=self.generator)
-                joints += START_NOISE * (2.0 * draw - 1.0)
+                q = scene.agent_qpos(agent)
+                noise = START_NOISE * (2.0 * draw(self.action_size) - 1.0)
+                state.qpos[rows, q.start + 7 : q.stop] += noise
         if self.starts is None:
             return {}
         frames = self.starts.qpos.shape[0]
-        draw = torch.rand(n, 2, device=self.device, generator=self.generator)
-        use = draw[:, 0] < self.starts.probability
-        frame = (draw[:, 1] * frames).long().clamp(max=frames - 1)
+        choice = draw(2)
+        use = choice[:, 0] < self.starts.probability
+        frame = (choice[:, 1] * frames).long().clamp(max=frames - 1)
         q, v = scene.agent_qpos(0), scene.agent_qvel(0)
-        state.qpos[:, q] = torch.where(use[:, None], self.starts.qpos[frame], state.qpos[:, q])
-        state.qvel[:, v] = torch.where(use[:, None], self.starts.qvel[frame], state.qvel[:, v])
+        for own, of_frames in ((state.qpos[:, q], "qpos"), (state.qvel[:, v], "qvel")):
+            drawn = getattr(self.starts, of_frames)[frame]
+            own[rows] = torch.where(use[:, None], drawn, own[rows])
         nan = torch.full((), torch.nan, device=self.device)
-        return {k: torch.where(use, c[frame], nan) for k, c in self.starts.context.items()}
+        context = {}
+        for name, labels in self.starts.context.items():
+            context[name] = torch.full((self.num_worlds,), torch.nan, device=self.device)
+            context[name][rows] = torch.where(use, labels[frame], nan)
+        return context
 
     def _observe(self, view: View | None = None, memory: Memory | None = None) -> Tensor:
         """(n, A, obs) of a view's worlds; by default of all."""
@@ -252,8 +263,7 @@ class Env:
                 slices[f"goal/{name}"] = slice(at, at + value.shape[-1])
                 at += value.shape[-1]
             self.obs_slices = slices
-        obs = torch.cat((proprioception(view.physics, view.heading), *goal.values()), dim=-1)
-        return torch.nan_to_num(obs)
+        return proprioception(view.physics, view.heading, tuple(goal.values())).nan_to_num_()
 
     def snapshot(self) -> dict[str, Tensor]:
         """Copies of qpos, qvel, mocap_pos and ground_force, for recordings."""
