@@ -13,12 +13,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sports.frames import Heading, proprioception, proprioception_slices
+from sports.frames import proprioception, proprioception_slices
 from sports.humanoid.body import Limits, Strength, load_body
-from sports.physics import Geometry, Physics, PhysicsState, default_state, make_physics
+from sports.physics import Physics, PhysicsState, default_state, make_physics
 from sports.registry import get_task, make_config
 from sports.scene import Scene
-from sports.task import Memory, Task, View
+from sports.task import Memory, Task, View, falling_heights
 
 START_NOISE = 0.02
 """Joint noise of a training start (rad), uniform."""
@@ -102,14 +102,13 @@ class Env:
         self.memory: Memory = {}
         self.view = View(
             physics=physics,
-            geometry=Geometry(body, self.device),
+            geometry=physics.geometry,
             config=config,
             curriculum=task.curriculum(config, n, self.device) if task.curriculum else {},
             clock=torch.zeros(n, dtype=torch.long, device=self.device),
-            heading=Heading(physics.body_quat[:, :, 0]),
             control_timestep=scene.control_timestep,
             foot_links=torch.tensor(foot, device=self.device),
-            head_index=body.link_index("Head"),
+            lowest=torch.tensor(falling_heights(body.link_names, foot), device=self.device),
         )
         self._default = default_state(scene, n, self.device)
         self.final_snapshot: dict[str, Tensor] = {}
@@ -170,9 +169,9 @@ class Env:
             ended_well = (terminated | truncated) & ~bad
             self.view.curriculum = self.task.promote(self.view, self.memory, step, ended_well)
 
-        obs = final_obs
-        # On a CPU asking costs nothing and saves the work; on a GPU it would wait.
-        if self.device.type != "cpu" or bool(ended.any()):
+        if self.device.type == "cpu":
+            obs = self._restart(ended, final_obs)
+        else:
             self._reset(ended)
             obs = self._observe()
         return StepResult(
@@ -188,14 +187,7 @@ class Env:
         )
 
     def _reset(self, mask: Tensor) -> None:
-        state = self._default.clone()
-        context = self._draw_start(state)
-        state, context = self.task.start(self.view, state, context, self.generator, self.training)
-        self.physics.reset(mask, state)
-        zero = torch.zeros((), dtype=torch.long, device=self.device)
-        self.view.clock = torch.where(mask, zero, self.view.clock)
-        self.age = torch.where(mask, zero, self.age)
-        self.view.refresh()
+        context = self._place(mask, slice(None))
         fresh = self.task.begin(self.view, context)
         if not self.memory:
             self.memory = fresh
@@ -204,28 +196,66 @@ class Env:
             for k, v in fresh.items()
         }
 
-    def _draw_start(self, state: PhysicsState) -> Memory:
+    def _restart(self, mask: Tensor, obs: Tensor) -> Tensor:
+        """Resets as :meth:`_reset` and returns the observations with new rows. Looks at the masked
+        worlds alone: on a GPU, asking which they are would wait for it."""
+        worlds = mask.nonzero()[:, 0]
+        if worlds.shape[0] == 0:
+            return obs
+        context = self._place(mask, worlds)
+        view = self.view.of(worlds)
+        fresh = self.task.begin(view, {k: v[worlds] for k, v in context.items()})
+        self.memory = {
+            k: v.index_copy(0, worlds, fresh[k].to(v.dtype)) for k, v in self.memory.items()
+        }
+        return obs.index_copy(0, worlds, self._observe(view, fresh))
+
+    def _place(self, mask: Tensor, rows: Tensor | slice) -> Memory:
+        """Puts the masked worlds at the start of an episode; the context of ``Task.begin``, with
+        what was drawn for ``rows``, which hold all of them."""
+        state = self._default.clone()
+        context = self._draw_start(state, rows)
+        state, context = self.task.start(self.view, state, context, self.generator, self.training)
+        self.physics.reset(mask, state)
+        self.view.clock = self.view.clock.masked_fill(mask, 0)
+        self.age = self.age.masked_fill(mask, 0)
+        self.view.refresh()
+        return context
+
+    def _draw_start(self, state: PhysicsState, rows: Tensor | slice) -> Memory:
         """Joint noise, or a frame of a demonstration; labels are NaN for a standing start."""
-        scene, n = self.physics.scene, self.num_worlds
+        scene = self.physics.scene
+        n = self.num_worlds if isinstance(rows, slice) else rows.shape[0]
+
+        def draw(size: int) -> Tensor:
+            return torch.rand(n, size, device=self.device, generator=self.generator)
+
         if self.training:
             for agent in range(self.num_agents):
-                joints = state.qpos[:, scene.agent_qpos(agent)][:, 7:]
-                draw = torch.rand(joints.shape, device=self.device, generator=self.generator)
-                joints += START_NOISE * (2.0 * draw - 1.0)
+                q = scene.agent_qpos(agent)
+                noise = START_NOISE * (2.0 * draw(self.action_size) - 1.0)
+                state.qpos[rows, q.start + 7 : q.stop] += noise
         if self.starts is None:
             return {}
         frames = self.starts.qpos.shape[0]
-        draw = torch.rand(n, 2, device=self.device, generator=self.generator)
-        use = draw[:, 0] < self.starts.probability
-        frame = (draw[:, 1] * frames).long().clamp(max=frames - 1)
+        choice = draw(2)
+        use = choice[:, 0] < self.starts.probability
+        frame = (choice[:, 1] * frames).long().clamp(max=frames - 1)
         q, v = scene.agent_qpos(0), scene.agent_qvel(0)
-        state.qpos[:, q] = torch.where(use[:, None], self.starts.qpos[frame], state.qpos[:, q])
-        state.qvel[:, v] = torch.where(use[:, None], self.starts.qvel[frame], state.qvel[:, v])
+        for own, of_frames in ((state.qpos[:, q], "qpos"), (state.qvel[:, v], "qvel")):
+            drawn = getattr(self.starts, of_frames)[frame]
+            own[rows] = torch.where(use[:, None], drawn, own[rows])
         nan = torch.full((), torch.nan, device=self.device)
-        return {k: torch.where(use, c[frame], nan) for k, c in self.starts.context.items()}
+        context = {}
+        for name, labels in self.starts.context.items():
+            context[name] = torch.full((self.num_worlds,), torch.nan, device=self.device)
+            context[name][rows] = torch.where(use, labels[frame], nan)
+        return context
 
-    def _observe(self) -> Tensor:
-        goal = self.task.features(self.view, self.memory)
+    def _observe(self, view: View | None = None, memory: Memory | None = None) -> Tensor:
+        """(n, A, obs) of a view's worlds; by default of all."""
+        view, memory = view or self.view, memory or self.memory
+        goal = self.task.features(view, memory)
         if not self.obs_slices:
             slices = proprioception_slices(self.physics.scene.body.num_links)
             at = slices["body_angvel"].stop
@@ -233,11 +263,7 @@ class Env:
                 slices[f"goal/{name}"] = slice(at, at + value.shape[-1])
                 at += value.shape[-1]
             self.obs_slices = slices
-        obs = torch.cat(
-            (proprioception(self.physics, self.view.heading, self.view.rotation), *goal.values()),
-            dim=-1,
-        )
-        return torch.nan_to_num(obs)
+        return proprioception(view.physics, view.heading, tuple(goal.values())).nan_to_num_()
 
     def snapshot(self) -> dict[str, Tensor]:
         """Copies of qpos, qvel, mocap_pos and ground_force, for recordings."""
@@ -281,7 +307,7 @@ class Env:
         if load_extra is not None:
             prefix = "physics/"
             load_extra({k[len(prefix) :]: v for k, v in moved.items() if k.startswith(prefix)})
-        self.view.clock, self.age = moved["clock"], moved["age"]
+        self.view.clock, self.age = moved["clock"].clone(), moved["age"].clone()
         self.generator.set_state(moved["generator"].cpu())
         self.memory = {k[7:]: v for k, v in moved.items() if k.startswith("memory/")}
         self.view.curriculum = {k[11:]: v for k, v in moved.items() if k.startswith("curriculum/")}

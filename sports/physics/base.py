@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -44,6 +44,8 @@ class Physics(Protocol):
     scene: Scene
     num_worlds: int
     device: torch.device
+    geometry: Geometry
+    """Support points of the scene's body."""
 
     qpos: Tensor
     """(N, nq)"""
@@ -55,6 +57,8 @@ class Physics(Protocol):
     """(N, A, B, 3) link origins p_WB."""
     body_quat: Tensor
     """(N, A, B, 4) link rotations R_WB."""
+    body_rot: Tensor
+    """(N, A, B, 3, 3) the same as matrices."""
     body_linvel: Tensor
     """(N, A, B, 3) velocity of the link origins, world frame."""
     body_angvel: Tensor
@@ -99,6 +103,30 @@ class Physics(Protocol):
     def close(self) -> None:
         """Frees threads and device memory."""
         ...
+
+
+class SomeWorlds:
+    """Some worlds of an engine, by index: copies of its tensors' rows, to look at."""
+
+    def __init__(self, physics: Physics, worlds: Tensor) -> None:
+        self._physics, self._worlds = physics, worlds
+        self.num_worlds = worlds.shape[0]
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._physics, name)
+        if isinstance(value, Tensor) and value.dim() > 0:
+            value = value[self._worlds]
+            setattr(self, name, value)
+        return value
+
+    def extent(self, direction: Tensor) -> Tensor:
+        return self._physics.extent(direction)[self._worlds]
+
+    def step(self, ctrl: Tensor) -> None:
+        raise NotImplementedError("only the whole engine can step")
+
+    def reset(self, mask: Tensor, state: PhysicsState) -> None:
+        raise NotImplementedError("only the whole engine can reset")
 
 
 def default_state(scene: Scene, num_worlds: int, device: torch.device | str) -> PhysicsState:
@@ -162,13 +190,20 @@ class Geometry:
         return self.radii[self.padded]
 
     def link_points(self, body_pos: Tensor, rotation: Tensor) -> Tensor:
-        """(..., B, K', 3) support points in the world, by link and padded by repetition to the
+        """(N, ..., B, K', 3) support points in the world, by link and padded by repetition to the
         link with most; the balls around them have ``link_radii`` (B, K'). ``rotation`` is R_WB
-        (..., B, 3, 3)."""
-        # Written out: a batch of tiny matrix products is slow on a CPU.
-        x, y, z = rotation[..., None, :, :].unbind(-1)  # columns, (..., B, 1, 3)
+        (N, ..., B, 3, 3)."""
+        # By coordinate and with the worlds in the last axis: rows of three numbers, and tiny
+        # matrix products, are slow on a CPU.
+        turn, origin = rotation.movedim((-2, -1, 0), (0, 1, -1)), body_pos.movedim((-1, 0), (0, -1))
         px, py, pz = self._padded_points[..., None].unbind(-2)  # (B, K', 1)
-        return body_pos[..., None, :] + x * px + y * py + z * pz
+        along = [
+            torch.addcmul(origin[i][..., None, :], turn[i, 0][..., None, :], px)
+            .addcmul_(turn[i, 1][..., None, :], py)
+            .addcmul_(turn[i, 2][..., None, :], pz)
+            for i in range(3)
+        ]
+        return torch.stack(along).movedim((0, -1), (-1, 0))
 
     @property
     def link_radii(self) -> Tensor:
@@ -188,12 +223,14 @@ class Geometry:
         ``rotation``: R_WB of the agent's links (N, B, 3, 3), where it is at hand.
         """
         if rotation is None:
-            rotation = quaternion.matrix(physics.body_quat[:, agent])
-        arm = (rotation @ self.center[..., None])[..., 0]  # (N, B, 3)
-        share = self.mass / self.mass.sum()
+            rotation = physics.body_rot[:, agent]
+        x, y, z = rotation.unbind(-1)
+        cx, cy, cz = self.center[..., None].unbind(-2)
+        arm = x * cx + y * cy + z * cz  # (N, B, 3)
+        share = (self.mass / self.mass.sum())[:, None]
         spin = quaternion.cross(physics.body_angvel[:, agent], arm)
-        position = share @ (physics.body_pos[:, agent] + arm)
-        return position, share @ (physics.body_linvel[:, agent] + spin)
+        position = (share * (physics.body_pos[:, agent] + arm)).sum(1)
+        return position, (share * (physics.body_linvel[:, agent] + spin)).sum(1)
 
     def extent(self, body_pos: Tensor, body_quat: Tensor, direction: Tensor) -> Tensor:
         """(..., B) furthest reach along unit ``direction`` (3,) of each link, m."""
@@ -209,8 +246,6 @@ SPEED_LIMIT = 2000.0
 
 def diverged(qpos: Tensor, qvel: Tensor) -> Tensor:
     """(N,) worlds whose numbers are not finite or beyond any athlete or bar."""
-    return ~(
-        torch.isfinite(qpos).all(-1)
-        & torch.isfinite(qvel).all(-1)
-        & (qvel.abs().amax(-1) < SPEED_LIMIT)
-    )
+    # NaN is the largest of all, and not below any bound.
+    furthest, fastest = qpos.abs().amax(-1), qvel.abs().amax(-1)
+    return ~((furthest < torch.inf) & (fastest < SPEED_LIMIT))

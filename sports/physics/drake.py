@@ -30,6 +30,7 @@ from pydrake.multibody.tree import FixedOffsetFrame, RigidBody
 from pydrake.systems.framework import Context
 from torch import Tensor
 
+from sports import quaternion
 from sports.humanoid.drake_plant import (
     DrakeHumanoid,
     add_ground,
@@ -306,6 +307,7 @@ class DrakePhysics:
         lin, ang = tensor(self._lin), tensor(self._ang)
         self.body_pos, self.object_pos = pos[:, :k].view(n, agents, links, 3), pos[:, k:]
         self.body_quat, self.object_quat = quat[:, :k].view(n, agents, links, 4), quat[:, k:]
+        self.body_rot = quaternion.matrix(self.body_quat)
         self.body_linvel, self.object_linvel = lin[:, :k].view(n, agents, links, 3), lin[:, k:]
         self.body_angvel, self.object_angvel = ang[:, :k].view(n, agents, links, 3), ang[:, k:]
         self.mocap_pos = tensor(self._mocap)

@@ -264,6 +264,7 @@ class WarpPhysics:
         k, o = agents * links, len(scene.free_objects)
         xpos, xquat = view(d.xpos)[:, 1 : 1 + k + o], view(d.xquat)[:, 1 : 1 + k + o]
         self._cvel = view(d.cvel)[:, 1 : 1 + k + o]
+        self.body_rot = view(d.xmat)[:, 1 : 1 + k].unflatten(1, (agents, links))
         self._com = view(d.subtree_com)
         self._roots = torch.tensor(model.body_rootid[1 : 1 + k + o], device=self.device).long()
         self.body_pos = xpos[:, :k].unflatten(1, (agents, links))

@@ -1,0 +1,129 @@
+"""What the ``mujoco`` engine shows of its worlds after a step or a reset.
+
+Float32 arrays with the components first and the worlds last: an operation on one component then
+runs over all links and worlds at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from sports.physics.kinematics import Kinematics, Pose
+from sports.physics.vectors import rotation
+from sports.scene import Scene
+
+Rows = slice | np.ndarray
+"""Some worlds: all, or by index."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Of some bodies (...) in N worlds; m, m/s, rad/s, world frame."""
+
+    pos: np.ndarray
+    """(3, ..., N) origins."""
+    quat: np.ndarray
+    """(4, ..., N)"""
+    linvel: np.ndarray
+    """(3, ..., N) velocities of the origins."""
+    angvel: np.ndarray
+    """(3, ..., N)"""
+
+    @classmethod
+    def zeros(cls, *shape: int) -> Motion:
+        """For bodies and worlds of ``shape`` (..., N)."""
+        return cls(*(np.zeros((k, *shape), np.float32) for k in (3, 4, 3, 3)))
+
+    def of(self, worlds: slice) -> Motion:
+        """Views of some worlds."""
+        return Motion(*(getattr(self, f.name)[..., worlds] for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class Results:
+    """The tensors of ``Physics`` for N worlds."""
+
+    qpos: np.ndarray
+    """(N, nq)"""
+    qvel: np.ndarray
+    """(N, nv)"""
+    mocap_pos: np.ndarray
+    """(N, M, 3)"""
+    links: Motion
+    """(A, B, N)"""
+    rotation: np.ndarray
+    """(3, 3, A, B, N) R_WB of the links."""
+    objects: Motion
+    """(O, N)"""
+    ground_force: np.ndarray
+    """(3, A B, N) as ``Physics.ground_force``"""
+    pair_force: np.ndarray
+    """(3, P, N) of that substep in which it was largest."""
+
+    @classmethod
+    def zeros(cls, scene: Scene, n: int) -> Results:
+        """For ``n`` worlds of a scene."""
+        agents, links = scene.num_agents, scene.body.num_links
+        return cls(
+            qpos=np.zeros((n, scene.nq), np.float32),
+            qvel=np.zeros((n, scene.nv), np.float32),
+            mocap_pos=np.zeros((n, len(scene.mocap_objects), 3), np.float32),
+            links=Motion.zeros(agents, links, n),
+            rotation=np.zeros((3, 3, agents, links, n), np.float32),
+            objects=Motion.zeros(len(scene.free_objects), n),
+            ground_force=np.zeros((3, agents * links, n), np.float32),
+            pair_force=np.zeros((3, len(scene.contact_pairs), n), np.float32),
+        )
+
+    def of(self, worlds: slice) -> Results:
+        """Views of some worlds."""
+        return Results(
+            self.qpos[worlds],
+            self.qvel[worlds],
+            self.mocap_pos[worlds],
+            self.links.of(worlds),
+            self.rotation[..., worlds],
+            self.objects.of(worlds),
+            self.ground_force[..., worlds],
+            self.pair_force[..., worlds],
+        )
+
+
+class Display:
+    """Writes results from states."""
+
+    def __init__(self, scene: Scene, kinematics: Kinematics, out: Results) -> None:
+        self._scene, self._kinematics, self._out = scene, kinematics, out
+
+    def state(self, rows: Rows, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
+        """Everything but forces, of states (n, nq), (n, nv), (n, M, 3)."""
+        with np.errstate(all="ignore"):
+            for agent in range(self._scene.num_agents):
+                own = qpos[:, self._scene.agent_qpos(agent)]
+                pose = self._kinematics.pose(own, qvel[:, self._scene.agent_qvel(agent)])
+                self.athlete(agent, rows, own[:, :3], pose)
+            self.rest(rows, qpos, qvel, mocap)
+
+    def athlete(self, agent: int, rows: Rows, root: np.ndarray, pose: Pose) -> None:
+        """The links of an athlete with its root at (n, 3)."""
+        links, order = self._out.links, self._kinematics.table
+        links.pos[:, agent][..., rows] = pose.pos[:, order] + root.T[:, None]
+        links.quat[:, agent][..., rows] = pose.quat[:, order]
+        links.linvel[:, agent][..., rows] = pose.velocity[:, order]
+        links.angvel[:, agent][..., rows] = pose.spin[:, order]
+        self._out.rotation[:, :, agent][..., rows] = pose.rot[:, :, order]
+
+    def rest(self, rows: Rows, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
+        """The state itself, and the objects."""
+        out, objects = self._out, self._out.objects
+        out.qpos[rows], out.qvel[rows], out.mocap_pos[rows] = qpos, qvel, mocap
+        for k, o in enumerate(self._scene.free_objects):
+            pos, quat = np.split(qpos[:, self._scene.object_qpos(o.name)].T, [3])
+            linear, (x, y, z) = np.split(qvel[:, self._scene.object_qvel(o.name)].T, 2)
+            quat = quat / np.sqrt((quat * quat).sum(0))
+            turn = rotation(quat)
+            objects.pos[:, k][:, rows], objects.quat[:, k][:, rows] = pos, quat
+            objects.linvel[:, k][:, rows] = linear
+            objects.angvel[:, k][:, rows] = turn[:, 0] * x + turn[:, 1] * y + turn[:, 2] * z
