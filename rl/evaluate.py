@@ -92,6 +92,9 @@ class _Played:
     """By trial; all that may turn out best or median."""
     overflow: int
     nan_worlds: int
+    timestep: float
+    """Of the engine (s): Drake may take more of them than the scene asks for."""
+    substeps: int
 
 
 def evaluate(
@@ -146,7 +149,7 @@ def evaluate(
     strength = strength or str(card.get("strength", "paper"))
     limits = limits or str(card.get("limits", "paper"))
     options = dict(options or {})
-    scene = make_scene(
+    make_scene(  # a mistake is told before any process starts
         task,
         strength=strength,  # type: ignore[arg-type]
         limits=limits,  # type: ignore[arg-type]
@@ -187,8 +190,8 @@ def evaluate(
         "strength": strength,
         "limits": limits,
         "options": options,
-        "timestep": scene.timestep,
-        "substeps": scene.substeps,
+        "timestep": played[0].timestep,
+        "substeps": played[0].substeps,
         "start_noise": start_noise,
         "trials": trials,
         "seed": seed,
@@ -360,7 +363,14 @@ def _play_episodes(
         for trial in sorted(keep)
     }
     physics = env.physics
-    return _Played(trials, recordings, int(physics.overflow), int(physics.nan_worlds))
+    return _Played(
+        trials,
+        recordings,
+        int(physics.overflow),
+        int(physics.nan_worlds),
+        timestep=getattr(physics, "timestep", physics.scene.timestep),
+        substeps=getattr(physics, "substeps", physics.scene.substeps),
+    )
 
 
 def _settled(value: float, bad: bool, unit: str) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import subprocess
@@ -74,7 +75,7 @@ def test_options_of_a_task_reach_its_config():
         ("evaluate hi_jump --policy zero --out x.json", "unknown task 'hi_jump'"),
         ("evaluate hi_jump --policy zero --out x.json", "high_jump"),
         ("evaluate high_jump --policy zero --out x.json --task.bar 1", "--task.bar-height"),
-        ("evaluate high_jump --policy zero --out x.json --task.bar-height 99", "bar_height"),
+        ("evaluate high_jump --policy zero --out x.json --task.bar-height 99", "not 99.0"),
         ("evaluate high_jump --policy nowhere --out x.json", "no policy 'nowhere'"),
         ("evaluate high_jump --policy zero --out x.json --trials 0", "trials"),
         ("verify high_jump --policy zero --trials 0 --out x", "trials"),
@@ -154,6 +155,32 @@ def test_evaluate_writes_the_schema_and_repeats_itself(tmp_path: Path):
     assert results[0] == results[1]
     success = results[0]["metrics"]["success"]
     assert success.keys() == {"mean", "ci95", "n", "unit"} and success["n"] == 3
+
+
+def finer_policy(folder: Path, **settings: object) -> Path:
+    """A small policy of the long jump whose card says at which time step it was trained."""
+    from rl.policy import export_policy
+    from rl.ppo import PPOConfig
+    from rl.train import TrainConfig, train
+
+    small = PPOConfig(hidden=(16, 16), steps=4, minibatches=1, epochs=1)
+    config = TrainConfig("long_jump", folder / "run", worlds=2, samples=8, ppo=small, quiet=True)
+    train(dataclasses.replace(config, **settings))
+    return export_policy(folder / "run", folder / "policy")
+
+
+@pytest.mark.parametrize("divisor, vary", [(1, False), (2, False), (2, True)])
+def test_every_policy_is_played_at_the_tasks_own_step(divisor, vary, tmp_path: Path, capsys):
+    """4 x 1/120 s whatever its card says, and a line where the card says something else."""
+    policy = finer_policy(tmp_path, timestep_divisor=divisor, vary=vary)
+    out = tmp_path / "x.json"
+    assert cli.main(f"evaluate long_jump --policy {policy} --trials 2 --out {out}".split()) == 0
+    text = capsys.readouterr().out
+    result = json.loads(out.read_text())
+    assert (result["timestep"], result["substeps"]) == (pytest.approx(1 / 120), 4)
+    assert "mujoco at 4 x 1/120 s" in text
+    assert ("note: the policy was trained at 8 x 1/240 s" in text) == (divisor == 2)
+    assert ("some of its worlds" in text) == vary
 
 
 def test_evaluate_survives_no_place_to_write(tmp_path: Path, capsys):
