@@ -608,7 +608,9 @@ def _settle(config: TrainConfig) -> TrainConfig:
     changes = {}
     for f in dataclasses.fields(TrainConfig):
         given, own = getattr(config, f.name), getattr(stored, f.name)
-        if f.name in _FREE:
+        if f.name == "options":
+            _same_options(config.task, given, own)
+        elif f.name in _FREE:
             if given == getattr(plain, f.name) and f.name in ("samples", "minutes"):
                 changes[f.name] = own
             else:
@@ -621,6 +623,25 @@ def _settle(config: TrainConfig) -> TrainConfig:
     if stored.task != config.task:
         raise ValueError(f"{config.out} is a run of task '{stored.task}', not of '{config.task}'")
     return replace(stored, **changes)
+
+
+def _same_options(task: str, given: dict[str, Any], own: dict[str, Any]) -> None:
+    """Raises ValueError where a task option that was asked for is not the run's.
+
+    The command line gives every option of the task, asked for or not, so that one at its default
+    asks for nothing; lists are what JSON made of the run's tuples.
+    """
+    from sports.registry import get_task, task_names
+
+    plain = dataclasses.asdict(get_task(task).config()) if task in task_names() else {}
+    for name, value in given.items():
+        asked = json.loads(json.dumps(value))
+        default = json.loads(json.dumps(plain.get(name)))
+        if asked not in (default, own.get(name, default)):
+            raise ValueError(
+                f"{name} {value!r} differs from the run's {own.get(name, default)!r}: a resumed "
+                "run keeps its settings; leave it out, or start a new run in another --out"
+            )
 
 
 def config_from_dict(data: dict[str, Any]) -> TrainConfig:

@@ -153,6 +153,22 @@ def test_settings_that_contradict_a_run_are_refused(tmp_path):
         TrainConfig(task="toy", paper=True, ppo=SMALL)
 
 
+def test_a_command_line_resumes_a_run_with_the_runs_own_options(tmp_path, capsys):
+    """The plain command line continues; the same option again is no contradiction."""
+    out = ["high_jump", "--out", str(tmp_path / "run"), "--quiet"]
+    levels = ["--task.levels", "0.4", "0.6", "--task.bar-height", "1.2"]
+    small = ["--worlds", "2", "--ppo.hidden", "8", "--ppo.steps", "4", "--samples", "8"]
+    assert main([*out, *small, *levels]) == 0
+    for n, again in enumerate(([], ["--task.bar-height", "1.2"], levels), start=2):
+        assert main([*out, "--resume", "--samples", str(8 * n), *again]) == 0
+        own = json.loads((tmp_path / "run" / "config.json").read_text())["config"]["options"]
+        assert (own["bar_height"], own["levels"]) == (1.2, [0.4, 0.6])
+    assert [r["samples"] for r in read_progress(tmp_path / "run")] == [8, 16, 24, 32]
+    capsys.readouterr()
+    assert main([*out, "--resume", "--task.bar-height", "1.5"]) == 2
+    assert "bar_height 1.5 differs from the run's 1.2" in capsys.readouterr().err
+
+
 def test_fine_tuning_starts_from_the_policy(tmp_path):
     first = train(toy_config(tmp_path / "a", samples=8 * 1024), environment=toy_env)
     before = {k: v for k, v in last(tmp_path / "a").items() if k.startswith("agent/actor.")}
