@@ -1,7 +1,8 @@
-"""Playing a policy: ``train``, ``evaluate`` and ``render``, with a progress display."""
+"""What one does with a policy: ``train``, ``export``, ``evaluate`` and ``render`` it."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,7 @@ from olympics_opt.progress import progress
 from warmstart import atomic
 
 if TYPE_CHECKING:
-    from olympics_opt.cli import Evaluate, Render, Verify
+    from olympics_opt.cli import Evaluate, Export, Render, Verify
     from rl.evaluate import EvaluationResult
 
 
@@ -197,3 +198,37 @@ def run_train(args: list[str]) -> int:
         f"{summary.minutes:.1f} minutes: {summary.checkpoint}"
     )
     return 0
+
+
+def run_export(config: Export) -> int:
+    """The command. Raises ValueError for a run or a result that cannot be used, OSError where the
+    file cannot be written."""
+    from rl.policy import export_policy
+
+    if not config.run.is_dir():
+        raise ValueError(f"there is no run '{config.run}': give the folder that `train` wrote")
+    if config.out.suffix != ".safetensors":
+        raise ValueError(f"{config.out} must end in .safetensors")
+    metrics, of = None, ""
+    if config.result is not None:
+        metrics, of = _measured(config.result)
+    atomic.prepare(config.out)
+    path = export_policy(
+        config.run,
+        config.out,
+        metrics=metrics,
+        metrics_of=of,
+        looks=config.looks,
+        critic=config.critic,
+    )
+    print(f"wrote {path} ({path.stat().st_size / 2**20:.1f} MiB) and {path.with_suffix('.json')}")
+    return 0
+
+
+def _measured(path: Path) -> tuple[dict[str, Any], str]:
+    """Metrics of a result file and the sha256 of its policy. Raises ValueError if it is none."""
+    try:
+        result = json.loads(path.read_text())
+        return dict(result["metrics"]), str(result["policy_sha256"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not a result of `evaluate` ({error!r})") from error
