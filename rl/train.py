@@ -111,7 +111,8 @@ class _Trainer:
             raise ValueError(f"--init {config.init} is a baseline: there is nothing to start from")
         if policy is not None and not config.paper:
             card = policy.metadata
-            shape = {"hidden": tuple(card["hidden"]), "activation": card["activation"]}
+            shape = {n: card[n] for n in ("hidden", "activation", "observation_clip")}
+            shape["hidden"] = tuple(shape["hidden"])
             config = replace(config, ppo=replace(config.ppo, **shape))
         self.config, self.hyper = config, config.hyper
         self.env = environment(config, config.seed + 7919 * self.rank)
