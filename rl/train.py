@@ -67,6 +67,7 @@ def train(
     starts: Starts | None = None,
     environment: MakeEnv = default_env,
     on_iteration: Callable[[Row], None] | None = None,
+    part: float = 1.0,
 ) -> RunSummary:
     """Trains until ``samples``, ``minutes`` or a signal, whichever is first.
 
@@ -75,6 +76,7 @@ def train(
         starts: demonstration frames; else those of ``config.clips``.
         environment: makes the environment, for tests and for tasks outside the registry.
         on_iteration: called with each progress row (rank 0).
+        part: stop after this part of the samples or minutes; a call with ``resume`` goes on.
 
     SIGTERM and SIGINT save a checkpoint and return, at the end of the iteration.
     Raises ValueError for settings that cannot be, PolicyError for ``init``, CheckpointError when
@@ -83,7 +85,7 @@ def train(
     began_group = join_ranks()
     try:
         config = settle(config)
-        return _Trainer(config, starts, environment, on_iteration).run()
+        return _Trainer(config, starts, environment, on_iteration).run(part)
     finally:
         if began_group:
             dist.destroy_process_group()
@@ -156,8 +158,8 @@ class _Trainer:
 
     # -- the loop -------------------------------------------------------------------------------
 
-    def run(self) -> RunSummary:
-        """Iterates until a stop criterion holds."""
+    def run(self, part: float) -> RunSummary:
+        """Iterates until a stop criterion holds for this part of the run."""
         config = self.config
         stop_samples = config.samples
         if stop_samples is None and config.minutes is None:
@@ -166,15 +168,15 @@ class _Trainer:
         if self.rank == 0:
             self._write_config()
             if self.resumed and not config.quiet:
-                print(f"resuming {config.out} at iteration {self.iteration}", flush=True)
+                print(f"{config.out} goes on after iteration {self.iteration}", flush=True)
         began = time.monotonic() - 60.0 * self.minutes
         last_saved, saved, stopped_by = self.minutes, None, ""
         try:
             with Signals() as signals:
                 while not stopped_by:
-                    if stop_samples is not None and self.samples >= stop_samples:
+                    if stop_samples is not None and self.samples >= part * stop_samples:
                         stopped_by = "samples"
-                    elif config.minutes is not None and self.minutes >= config.minutes:
+                    elif config.minutes is not None and self.minutes >= part * config.minutes:
                         stopped_by = "minutes"
                     elif signals.heard(self.device):
                         stopped_by = "signal"
@@ -214,8 +216,7 @@ class _Trainer:
 
     def _iterate(self, began: float, stop_samples: int | None) -> Row:
         """One rollout and its update. Waits for the device once, for the numbers of the row."""
-        share = self._share(stop_samples)
-        self._schedule(share)
+        self._schedule(self._share(stop_samples))
         clock = Stopwatch(self.device)
         clock.mark()
         with one_torch_thread(self.env.device):
@@ -236,9 +237,8 @@ class _Trainer:
             losses = self.agent.update(self.rollout)
         clock.mark()
         row: Row = {"iteration": self.iteration + 1}
-        agent = self.agent
-        numbers = {**losses, "learning_rate": agent.learning_rate, "sigma": agent.sigma}
-        names = list(numbers)
+        rates = {"learning_rate": self.agent.learning_rate, "sigma": self.agent.sigma}
+        numbers = losses | rates
         tail = torch.stack([x.double().to(self.device) for x in numbers.values()])
         episode = self.meter.totals().to(self.device)
         # Rank 0's clock decides for all: the others add 0 seconds.
@@ -254,7 +254,7 @@ class _Trainer:
             self.minutes = values[len(episode)] / 60.0
         self.iteration += 1
         self.samples += self.samples_each
-        losses_now = dict(zip(names, values[len(episode) + 1 :]))
+        losses_now = dict(zip(numbers, values[len(episode) + 1 :]))
         if not all(math.isfinite(v) for v in losses_now.values()):
             raise RuntimeError(
                 f"learning diverged at iteration {self.iteration} (a loss is not finite): go on "

@@ -80,8 +80,8 @@ def test_a_stopped_fine_tuning_continues(shipped: Path, tmp_path: Path, monkeypa
     """Asked to stop in its second part; the same call then finishes with all candidates."""
     real, calls = rl.train.train, []
 
-    def stopping(config: TrainConfig):
-        summary = real(config)
+    def stopping(config: TrainConfig, part: float):
+        summary = real(config, part=part)
         calls.append(summary)
         if len(calls) == 2:
             return dataclasses.replace(summary, stopped_by="signal")

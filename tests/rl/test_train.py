@@ -70,6 +70,16 @@ def test_a_resumed_run_repeats_the_uninterrupted_one_bit_for_bit(tmp_path, task)
     assert [r["iteration"] for r in read_progress(tmp_path / "halves")] == [1, 2, 3, 4]
 
 
+def test_a_run_in_parts_is_the_run_in_one_piece(tmp_path):
+    """Schedules too: they follow the whole run, not the part."""
+    fading = dataclasses.replace(SMALL, sigma_final=0.1)
+    train(toy_config(tmp_path / "whole", ppo=fading), environment=toy_env)
+    parts = toy_config(tmp_path / "parts", ppo=fading, resume=True)
+    for part, iterations in ((0.5, 2), (0.6, 3), (1.0, 4)):
+        assert train(parts, environment=toy_env, part=part).iterations == iterations
+    same_bits(tmp_path / "whole", tmp_path / "parts")
+
+
 def start(out: Path, samples: int, *args: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "tests.rl.toy", str(out), str(samples), *args]
     env = {**os.environ, "OMP_NUM_THREADS": "1"}
