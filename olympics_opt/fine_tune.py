@@ -38,7 +38,7 @@ class FineTuning:
     epochs: int = 2
     learning_rate: float = 5e-6
     """Constant: the KL control would raise it until the noise moves the policy."""
-    critic_warmup: int = 10
+    critic_warmup: int = 6
     """Iterations in which only the critic learns, if the policy comes without one."""
     start_probability: float = 0.25
     """Share of episodes that start from a state of a demonstration."""
