@@ -59,6 +59,8 @@ class Physics(Protocol):
     """(N, A, B, 4) link rotations R_WB."""
     body_rot: Tensor
     """(N, A, B, 3, 3) the same as matrices."""
+    felt: Tensor | None
+    """(N, A, 15 B - 2) proprioception of ``sports.frames``, where the engine knows a quick way."""
     body_linvel: Tensor
     """(N, A, B, 3) velocity of the link origins, world frame."""
     body_angvel: Tensor

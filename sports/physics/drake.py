@@ -69,6 +69,7 @@ class DrakePhysics:
     """
 
     engine = "drake"
+    felt = None
 
     def __init__(
         self,
