@@ -32,6 +32,8 @@ from torch import Tensor
 
 from sports import quaternion
 from sports.humanoid.drake_plant import (
+    OBJECT_DISSIPATION,
+    OBJECT_STIFFNESS,
     DrakeHumanoid,
     add_ground,
     add_humanoid,
@@ -348,7 +350,7 @@ def _add_object(
         rigid,
         obj.name,
         obj.shapes,
-        contact_properties(obj.friction),
+        contact_properties(obj.friction, OBJECT_STIFFNESS, OBJECT_DISSIPATION),
         ground=obj.motion == "free" and obj.meets_ground,
     )
     points.extend(own[0])

@@ -13,7 +13,7 @@ from sports.humanoid.mjcf import body_name
 from sports.physics.kinematics import Kinematics
 from sports.physics.momentum import AthleteKeeper, Tree
 from sports.physics.results import Display, Results
-from sports.physics.variation import Draw
+from sports.physics.variation import Draw, contact_softness
 from sports.physics.vectors import cross
 from sports.scene import Scene
 
@@ -45,6 +45,7 @@ class Worlds:
         ]
         self._peaks = _Peaks(batch.bind("sensordata"), out)
         self._timesteps: list[np.ndarray] | None = None
+        self._solref = model.geom_solref
         if drawn is not None:
             self._vary(drawn)
         batch.reset(stage=0)
@@ -106,7 +107,7 @@ class Worlds:
         """Gives each world its own numbers; see the ``warp`` engine."""
         expand = self.batch.expand
         expand("geom_friction")[:, :, 0] *= drawn.friction[:, None]
-        expand("geom_solref")[:, :, 0] = drawn.contact_time[:, None]
+        expand("geom_solref")[:] = contact_softness(self._solref, drawn)
         expand("actuator_gainprm")[:, :, 0] *= drawn.stiffness[:, None]
         expand("actuator_biasprm")[:, :, 1] *= drawn.stiffness[:, None]
         damping = expand("dof_damping")

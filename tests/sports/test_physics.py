@@ -246,7 +246,7 @@ def test_worlds_that_vary_are_the_same_on_both_engines():
 def test_a_coarse_world_is_a_plain_world():
     """Two substeps in one, then one of length zero, against the usual time step. In the air, where
     only the instant of the momentum's correction differs."""
-    neutral = Variation((1, 1), (1, 1), (1, 1), (0.02, 0.02), coarse_share=1.0)
+    neutral = Variation((1, 1), (1, 1), (1, 1), (0.02, 0.02), (1, 1), coarse_share=1.0)
     fine = make_scene("long_jump", timestep_divisor=2)
     varied = cpu(fine, 2, variation=neutral)
     plain = cpu(make_scene("long_jump"), 2)
