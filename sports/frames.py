@@ -6,13 +6,18 @@ place and direction on the field.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sports import quaternion
 from sports.physics.base import Physics
+
+Array = Any
+"""A numpy array or a torch tensor."""
 
 
 class Heading:
@@ -48,6 +53,27 @@ def proprioception_slices(num_links: int) -> dict[str, slice]:
     return slices
 
 
+def fill_proprioception(
+    rows: Array, cos: Array, sin: Array, pos: Array, rot: Array, linvel: Array, angvel: Array
+) -> None:
+    """Writes :func:`proprioception` of one athlete into ``rows`` (15 B - 2, N), from its heading
+    ``cos`` and ``sin`` (N), its links' positions and velocities (3, B, N) and R_WB (3, 3, B, N).
+
+    For numpy and torch alike. Components come first and worlds last: a row for each number is
+    quick on a CPU, three numbers for each row are not.
+    """
+    rows[0] = pos[2, 0]
+    at = 1
+    for vectors in (pos[:, 1:] - pos[:, :1], rot[:, :2].swapaxes(1, 2), linvel, angvel):
+        x, y, z = vectors[0], vectors[1], vectors[2]  # (..., N)
+        size = 3 * math.prod(x.shape[:-1])
+        block = rows[at : at + size].reshape(*x.shape[:-1], 3, x.shape[-1])
+        block[..., 0, :] = cos * x + sin * y
+        block[..., 1, :] = cos * y - sin * x
+        block[..., 2, :] = z
+        at += size
+
+
 def proprioception(physics: Physics, heading: Heading, more: Sequence[Tensor] = ()) -> Tensor:
     """(N, A, 15 B - 2) what an athlete feels of its own body: SMPL 358, SMPL-X 778.
 
@@ -55,28 +81,22 @@ def proprioception(physics: Physics, heading: Heading, more: Sequence[Tensor] = 
     columns of the rotation matrix, Zhou et al. 2019); linear and angular velocities; all but
     the height in the heading frame. ``more``: (N, A, k) features to append.
     """
-    n, a, b = physics.body_pos.shape[:3]
-    root = physics.body_pos[:, :, :1]
-    # A row for each number, over the worlds: long rows are quick on a CPU.
-    size = 15 * b - 2 + sum(x.shape[-1] for x in more)
-    rows = physics.body_pos.new_empty(a, size, n)
-    rows[:, 0] = root[:, :, 0, 2].T
-    parts = (
-        physics.body_pos[:, :, 1:] - root,
-        physics.body_rot.transpose(-1, -2)[:, :, :, :2],
-        physics.body_linvel,
-        physics.body_angvel,
-    )
-    at = 1
-    for part in parts:  # (N, A, ..., 3)
-        x, y, z = part.movedim((-1, 0), (0, -1))  # (A, ..., N)
-        block = rows[:, at : at + part[0, 0].numel()].view(*x.shape[:-1], 3, n)
-        c, s = (v.T.view(a, *[1] * (x.dim() - 2), n) for v in (heading.cos, heading.sin))
-        torch.addcmul(c * x, s, y, out=block[..., 0, :])
-        torch.addcmul(c * y, s, x, value=-1, out=block[..., 1, :])
-        block[..., 2, :] = z
-        at += part[0, 0].numel()
+    n, agents, links = physics.body_pos.shape[:3]
+    at = 15 * links - 2
+    size = at + sum(features.shape[-1] for features in more)
+    rows = physics.body_pos.new_empty(agents, size, n)
+    if physics.felt is not None:
+        rows[:, :at] = physics.felt.permute(1, 2, 0)
+    else:
+        pos, linvel, angvel = (
+            v.permute(1, 3, 2, 0)
+            for v in (physics.body_pos, physics.body_linvel, physics.body_angvel)
+        )
+        rot = physics.body_rot.permute(1, 3, 4, 2, 0)
+        for a in range(agents):
+            cos, sin = heading.cos[:, a], heading.sin[:, a]
+            fill_proprioception(rows[a, :at], cos, sin, pos[a], rot[a], linvel[a], angvel[a])
     for features in more:
         rows[:, at : at + features.shape[-1]] = features.permute(1, 2, 0)
         at += features.shape[-1]
-    return rows.flatten(0, 1).T.contiguous().unflatten(1, (a, -1))
+    return rows.flatten(0, 1).T.contiguous().unflatten(1, (agents, -1))

@@ -83,7 +83,8 @@ class View:
     def pressure(self) -> Tensor:
         """(N, A, B) squared force of the ground on each link (N^2), computed once a step."""
         if self._pressure is None:
-            self._pressure = self.physics.ground_force.square().sum(-1)
+            force = self.physics.ground_force.permute(3, 1, 2, 0)  # by component
+            self._pressure = force.square().sum(0).permute(2, 0, 1)
         return self._pressure
 
     def touching(self) -> Tensor:

@@ -71,6 +71,7 @@ class DrakePhysics:
     """
 
     engine = "drake"
+    felt = None
 
     def __init__(
         self,

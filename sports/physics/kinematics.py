@@ -70,7 +70,10 @@ class Kinematics:
         """(B,) where the links of the body's table are in a pose."""
         self._parent = self.table[parents[order[1:]]]
         ends = np.searchsorted(depth[order], np.arange(1, depth.max() + 2))
-        self._levels = [slice(a, b) for a, b in itertools.pairwise(ends)]
+        self._levels = [
+            (slice(a, b), slice(a - 1, b - 1), self._parent[a - 1 : b - 1])
+            for a, b in itertools.pairwise(ends)
+        ]
         self._joint = order[1:] - 1
 
         ids = np.array([model.body(body_name(agent, name)).id for name in body.link_names])[order]
@@ -108,31 +111,31 @@ class Kinematics:
         quat = np.empty((4, links, n), np.float32)
         root = qpos[:, 3:7].T
         quat[:, 0] = root / np.sqrt((root * root).sum(0))
-        for level in self._levels:
-            joints = slice(level.start - 1, level.stop - 1)
-            parent = quat[:, None, self._parent[joints]]
-            np.sum(parent * factors[:, :, joints], axis=0, out=quat[:, level])
+        for level, joints, parents in self._levels:
+            products = quat[:, None, parents] * factors[:, :, joints]
+            np.add.reduce(products, axis=0, out=quat[:, level])
 
         rot = rotation(quat)
-        base = rot[:, :, self._parent]  # of the links' parents
-        arm = base[:, 0] * self._offset[0]
+        base, own = rot[:, :, self._parent], rot[:, :, 1:]  # of the links' parents, and their own
+        parts = np.empty((6, links - 1, n), np.float32)
+        arm, about = parts[:3], parts[3:]
+        np.multiply(base[:, 0], self._offset[0], out=arm)
         arm += base[:, 1] * self._offset[1]
         arm += base[:, 2] * self._offset[2]
         # Hinge axes: x of the parent, z of the link, and between them y turned back about z.
         cos_z, sin_z = cos[2] * cos[2] - sin[2] * sin[2], 2.0 * sin[2] * cos[2]
-        own = rot[:, :, 1:]
-        about = base[:, 0] * rate[0]
+        np.multiply(base[:, 0], rate[0], out=about)
         about += own[:, 0] * (sin_z * rate[1])
         about += own[:, 1] * (cos_z * rate[1])
         about += own[:, 2] * rate[2]
 
-        pos, spin, velocity = np.empty((3, 3, links, n), np.float32)
-        pos[:, 0] = 0.0
+        sums, velocity = np.empty((6, links, n), np.float32), np.empty((3, links, n), np.float32)
+        pos, spin = sums[:3], sums[3:]
         x, y, z = qvel[:, 3:6].T
+        pos[:, 0] = 0.0
         spin[:, 0] = rot[:, 0, 0] * x + rot[:, 1, 0] * y + rot[:, 2, 0] * z
         velocity[:, 0] = qvel[:, :3].T
-        self._sum_up(pos, arm)
-        self._sum_up(spin, about)
+        self._sum_up(sums, parts)
         self._sum_up(velocity, cross(spin[:, self._parent], arm))
         return Pose(quat, rot, pos, spin, velocity)
 
@@ -164,10 +167,9 @@ class Kinematics:
         return Whole(np.stack((yy + zz, xx + zz, xx + yy, -xy, -xz, -yz)), angular, mean, com)
 
     def _sum_up(self, total: np.ndarray, part: np.ndarray) -> None:
-        """Adds to each link's ``part`` (3, B - 1, n) the ``total`` (3, B, n) of its parent."""
-        for level in self._levels:
-            joints = slice(level.start - 1, level.stop - 1)
-            np.add(total[:, self._parent[joints]], part[:, joints], out=total[:, level])
+        """Adds to each link's ``part`` (k, B - 1, n) the ``total`` (k, B, n) of its parent."""
+        for level, joints, parents in self._levels:
+            np.add(total[:, parents], part[:, joints], out=total[:, level])
 
 
 def _columns(values: np.ndarray) -> np.ndarray:

@@ -58,14 +58,14 @@ class MujocoPhysics:
         self.qpos, self.qvel = torch.from_numpy(out.qpos), torch.from_numpy(out.qvel)
         self.mocap_pos = torch.from_numpy(out.mocap_pos)
         self.body_pos, self.body_quat, self.body_linvel, self.body_angvel = _tensors(out.links)
+        self.felt = torch.from_numpy(out.felt).permute(2, 0, 1)
         self.body_rot = torch.from_numpy(out.rotation).permute(4, 2, 3, 0, 1)
         self.object_pos, self.object_quat, self.object_linvel, self.object_angvel = _tensors(
             out.objects
         )
         shape = (scene.num_agents, scene.body.num_links)
         self.ground_force = _turned(out.ground_force).unflatten(1, shape)
-        self._pair_force = _turned(out.pair_force)
-        self.pair_force = self._pair_force.norm(dim=-1)
+        self.pair_force = torch.from_numpy(out.pair_force).T
         self.bad = torch.zeros(n, dtype=torch.bool)
         self.nan_worlds = 0
         self.overflow = 0
@@ -73,7 +73,6 @@ class MujocoPhysics:
     def step(self, ctrl: Tensor) -> None:
         targets = ctrl.numpy()
         self._each(lambda rows, worlds: worlds.step(targets[rows]))
-        self.pair_force = self._pair_force.norm(dim=-1)
         self.bad = diverged(self.qpos, self.qvel)
         if self.bad.any():
             self.nan_worlds += int(self.bad.sum())
@@ -92,7 +91,6 @@ class MujocoPhysics:
         self._display.state(ids, qpos[ids], qvel[ids], mocap[ids])
         self._out.ground_force[..., ids] = 0.0
         self._out.pair_force[..., ids] = 0.0
-        self.pair_force = self._pair_force.norm(dim=-1)
 
     def extent(self, direction: Tensor) -> Tensor:
         return self.geometry.extent(self.body_pos, self.body_quat, direction)

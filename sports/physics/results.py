@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from sports.frames import fill_proprioception
 from sports.physics.kinematics import Kinematics, Pose
 from sports.physics.vectors import rotation
 from sports.scene import Scene
@@ -57,10 +58,12 @@ class Results:
     """(3, 3, A, B, N) R_WB of the links."""
     objects: Motion
     """(O, N)"""
+    felt: np.ndarray
+    """(A, 15 B - 2, N) as ``Physics.felt``"""
     ground_force: np.ndarray
     """(3, A B, N) as ``Physics.ground_force``"""
     pair_force: np.ndarray
-    """(3, P, N) of that substep in which it was largest."""
+    """(P, N) as ``Physics.pair_force``"""
 
     @classmethod
     def zeros(cls, scene: Scene, n: int) -> Results:
@@ -72,9 +75,10 @@ class Results:
             mocap_pos=np.zeros((n, len(scene.mocap_objects), 3), np.float32),
             links=Motion.zeros(agents, links, n),
             rotation=np.zeros((3, 3, agents, links, n), np.float32),
+            felt=np.zeros((agents, 15 * links - 2, n), np.float32),
             objects=Motion.zeros(len(scene.free_objects), n),
             ground_force=np.zeros((3, agents * links, n), np.float32),
-            pair_force=np.zeros((3, len(scene.contact_pairs), n), np.float32),
+            pair_force=np.zeros((len(scene.contact_pairs), n), np.float32),
         )
 
     def of(self, worlds: slice) -> Results:
@@ -86,6 +90,7 @@ class Results:
             self.links.of(worlds),
             self.rotation[..., worlds],
             self.objects.of(worlds),
+            self.felt[..., worlds],
             self.ground_force[..., worlds],
             self.pair_force[..., worlds],
         )
@@ -108,12 +113,18 @@ class Display:
 
     def athlete(self, agent: int, rows: Rows, root: np.ndarray, pose: Pose) -> None:
         """The links of an athlete with its root at (n, 3)."""
-        links, order = self._out.links, self._kinematics.table
-        links.pos[:, agent][..., rows] = pose.pos[:, order] + root.T[:, None]
+        out, links, order = self._out, self._out.links, self._kinematics.table
+        pos = (pose.pos[:, order] + root.T[:, None]).astype(np.float32)
+        rot, linvel, angvel = pose.rot[:, :, order], pose.velocity[:, order], pose.spin[:, order]
+        links.pos[:, agent][..., rows] = pos
         links.quat[:, agent][..., rows] = pose.quat[:, order]
-        links.linvel[:, agent][..., rows] = pose.velocity[:, order]
-        links.angvel[:, agent][..., rows] = pose.spin[:, order]
-        self._out.rotation[:, :, agent][..., rows] = pose.rot[:, :, order]
+        links.linvel[:, agent][..., rows] = linvel
+        links.angvel[:, agent][..., rows] = angvel
+        out.rotation[:, :, agent][..., rows] = rot
+        felt = np.empty((out.felt.shape[1], pos.shape[2]), np.float32)
+        yaw = np.arctan2(rot[1, 0, 0], rot[0, 0, 0])
+        fill_proprioception(felt, np.cos(yaw), np.sin(yaw), pos, rot, linvel, angvel)
+        out.felt[agent][:, rows] = felt
 
     def rest(self, rows: Rows, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
         """The state itself, and the objects."""

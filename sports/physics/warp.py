@@ -208,6 +208,7 @@ class WarpPhysics:
     """The ``warp`` engine; see :class:`sports.physics.base.Physics` for the tensors."""
 
     engine = "warp"
+    felt = None
 
     def __init__(
         self,

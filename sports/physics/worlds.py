@@ -147,7 +147,7 @@ class _Peaks:
     def __init__(self, sensors: np.ndarray, out: Results) -> None:
         """``sensors`` (n, 3 k), live: first those of the ground, then those of the pairs."""
         self._sensors, self._out = sensors, out
-        ground, pairs = out.ground_force.shape[1], out.pair_force.shape[1]
+        ground, pairs = out.ground_force.shape[1], len(out.pair_force)
         self._split = (ground, ground + pairs)
         self._force = np.zeros((len(sensors), sensors.shape[1] // 3, 3))
         self._square = np.zeros(self._force.shape[:2])
@@ -171,4 +171,4 @@ class _Peaks:
         """After the last substep."""
         ground, last = self._split
         self._out.ground_force[:] = self._force[:, :ground].T
-        self._out.pair_force[:] = self._force[:, ground:last].T
+        self._out.pair_force[:] = np.sqrt(self._square[:, ground:last]).T
