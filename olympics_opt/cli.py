@@ -174,8 +174,9 @@ class Study:
     """Sport with an optimisation problem and a trained policy; see ``olympics-opt list``."""
     out: Path
     """Folder for all stages and report.html."""
-    policy: str = "pretrained"
-    """Policy to fine-tune and to compare with."""
+    policy: str = "pretrained:ppo-human"
+    """Policy to fine-tune and to compare with; by default of the strength that the take-off is
+    optimised for."""
     minutes: float = 4.0
     """Training time on this machine."""
     worlds: int = 64
