@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -18,29 +18,8 @@ from sports.humanoid.body import Limits, Strength, load_body
 from sports.physics import Physics, PhysicsState, default_state, make_physics
 from sports.registry import get_task, make_config
 from sports.scene import Scene
+from sports.starts import Starts, Stock, add_noise
 from sports.task import Memory, Task, View, falling_heights
-
-START_NOISE = 0.02
-"""Joint noise of a training start (rad), uniform."""
-
-
-@dataclass
-class Starts:
-    """Frames of demonstrations from which episodes may start (reference-state initialisation)."""
-
-    qpos: Tensor
-    """(F, 7 + num_dofs) of one athlete, task world."""
-    qvel: Tensor
-    """(F, 6 + num_dofs)"""
-    context: dict[str, Tensor]
-    """(F,) labels of the frame's demonstration that the task understands (``bar_height``)."""
-    probability: float = 0.5
-    """Share of resets that start from a frame."""
-
-    def to(self, device: torch.device | str) -> Starts:
-        """The same frames on a device."""
-        context = {k: v.to(device) for k, v in self.context.items()}
-        return Starts(self.qpos.to(device), self.qvel.to(device), context, self.probability)
 
 
 @dataclass
@@ -111,6 +90,8 @@ class Env:
             lowest=torch.tensor(falling_heights(body.link_names, foot), device=self.device),
         )
         self._default = default_state(scene, n, self.device)
+        self._stocks = hasattr(physics, "prepare")
+        self._stock: Stock | None = None
         self.final_snapshot: dict[str, Tensor] = {}
         """State before the automatic reset of the last step, filled if ``keep_snapshot``."""
         self.keep_snapshot = False
@@ -169,8 +150,10 @@ class Env:
             ended_well = (terminated | truncated) & ~bad
             self.view.curriculum = self.task.promote(self.view, self.memory, step, ended_well)
 
-        if self.device.type == "cpu":
-            obs = self._restart(ended, final_obs)
+        if self._stocks:
+            # On a CPU, asking which worlds ended costs nothing and saves the work.
+            worlds = ended.nonzero()[:, 0]
+            obs = self._restart(worlds, final_obs) if worlds.numel() else final_obs
         else:
             self._reset(ended)
             obs = self._observe()
@@ -187,7 +170,11 @@ class Env:
         )
 
     def _reset(self, mask: Tensor) -> None:
-        context = self._place(mask, slice(None))
+        state, context = self._draw()
+        self.physics.reset(mask, state)
+        self.view.clock = self.view.clock.masked_fill(mask, 0)
+        self.age = self.age.masked_fill(mask, 0)
+        self.view.refresh()
         fresh = self.task.begin(self.view, context)
         if not self.memory:
             self.memory = fresh
@@ -196,61 +183,44 @@ class Env:
             for k, v in fresh.items()
         }
 
-    def _restart(self, mask: Tensor, obs: Tensor) -> Tensor:
-        """Resets as :meth:`_reset` and returns the observations with new rows. Looks at the masked
-        worlds alone: on a GPU, asking which they are would wait for it."""
-        worlds = mask.nonzero()[:, 0]
-        if worlds.shape[0] == 0:
-            return obs
-        context = self._place(mask, worlds)
-        view = self.view.of(worlds)
-        fresh = self.task.begin(view, {k: v[worlds] for k, v in context.items()})
-        self.memory = {
-            k: v.index_copy(0, worlds, fresh[k].to(v.dtype)) for k, v in self.memory.items()
-        }
-        return obs.index_copy(0, worlds, self._observe(view, fresh))
-
-    def _place(self, mask: Tensor, rows: Tensor | slice) -> Memory:
-        """Puts the masked worlds at the start of an episode; the context of ``Task.begin``, with
-        what was drawn for ``rows``, which hold all of them."""
-        state = self._default.clone()
-        context = self._draw_start(state, rows)
-        state, context = self.task.start(self.view, state, context, self.generator, self.training)
-        self.physics.reset(mask, state)
-        self.view.clock = self.view.clock.masked_fill(mask, 0)
-        self.age = self.age.masked_fill(mask, 0)
+    def _restart(self, worlds: Tensor, obs: Tensor) -> Tensor:
+        """Resets worlds, by index, from the stock; ``obs`` with their new rows."""
+        stock = self._stock
+        if stock is None or not stock.serves(worlds, self.curriculum):
+            stock = self._stock = self._prepare()
+        stock.used[worlds] = True
+        cast(Any, self.physics).restart(worlds, stock.shown)
+        self.view.clock = self.view.clock.index_fill(0, worlds, 0)
+        self.age = self.age.index_fill(0, worlds, 0)
         self.view.refresh()
-        return context
+        self.memory = {
+            k: v.index_copy(0, worlds, stock.memory[k][worlds]) for k, v in self.memory.items()
+        }
+        return obs.index_copy(0, worlds, stock.obs[worlds])
 
-    def _draw_start(self, state: PhysicsState, rows: Tensor | slice) -> Memory:
-        """Joint noise, or a frame of a demonstration; labels are NaN for a standing start."""
-        scene = self.physics.scene
-        n = self.num_worlds if isinstance(rows, slice) else rows.shape[0]
+    def _prepare(self) -> Stock:
+        generator = self.generator.get_state()
+        state, context = self._draw()
+        shown = cast(Any, self.physics).prepare(state)
+        view = dataclasses.replace(self.view, physics=shown)
+        view.refresh()
+        fresh = self.task.begin(view, context)
+        return Stock(
+            shown=shown,
+            memory={k: v.to(self.memory[k].dtype) for k, v in fresh.items()},
+            obs=self._observe(view, fresh),
+            curriculum=dict(self.curriculum),
+            generator=generator,
+            used=torch.zeros(self.num_worlds, dtype=torch.bool),
+        )
 
-        def draw(size: int) -> Tensor:
-            return torch.rand(n, size, device=self.device, generator=self.generator)
-
+    def _draw(self) -> tuple[PhysicsState, Memory]:
+        """The start of an episode in every world, and the context of ``Task.begin``."""
+        state, scene = self._default.clone(), self.physics.scene
         if self.training:
-            for agent in range(self.num_agents):
-                q = scene.agent_qpos(agent)
-                noise = START_NOISE * (2.0 * draw(self.action_size) - 1.0)
-                state.qpos[rows, q.start + 7 : q.stop] += noise
-        if self.starts is None:
-            return {}
-        frames = self.starts.qpos.shape[0]
-        choice = draw(2)
-        use = choice[:, 0] < self.starts.probability
-        frame = (choice[:, 1] * frames).long().clamp(max=frames - 1)
-        q, v = scene.agent_qpos(0), scene.agent_qvel(0)
-        for own, of_frames in ((state.qpos[:, q], "qpos"), (state.qvel[:, v], "qvel")):
-            drawn = getattr(self.starts, of_frames)[frame]
-            own[rows] = torch.where(use[:, None], drawn, own[rows])
-        nan = torch.full((), torch.nan, device=self.device)
-        context = {}
-        for name, labels in self.starts.context.items():
-            context[name] = torch.full((self.num_worlds,), torch.nan, device=self.device)
-            context[name][rows] = torch.where(use, labels[frame], nan)
-        return context
+            add_noise(state, scene, self.generator)
+        context = self.starts.draw(state, scene, self.generator) if self.starts else {}
+        return self.task.start(self.view, state, context, self.generator, self.training)
 
     def _observe(self, view: View | None = None, memory: Memory | None = None) -> Tensor:
         """(n, A, obs) of a view's worlds; by default of all."""
@@ -288,6 +258,8 @@ class Env:
         extra = getattr(self.physics, "extra_state", None)
         if extra is not None:
             state |= {f"physics/{k}": v for k, v in extra().items()}
+        if self._stock is not None:
+            state |= {f"stock/{k}": v for k, v in self._stock.state_dict().items()}
         state |= {f"memory/{k}": v.clone() for k, v in self.memory.items()}
         state |= {f"curriculum/{k}": v.clone() for k, v in self.curriculum.items()}
         return state
@@ -299,7 +271,7 @@ class Env:
         """
         if "qpos" not in state or state["qpos"].shape != self.physics.qpos.shape:
             raise ValueError("the environment state is of another task or number of worlds")
-        moved = {k: v if k == "generator" else v.to(self.device) for k, v in state.items()}
+        moved = {k: v if "generator" in k else v.to(self.device) for k, v in state.items()}
         everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
         physics_state = PhysicsState(moved["qpos"], moved["qvel"], moved["mocap_pos"])
         self.physics.reset(everyone, physics_state)
@@ -308,11 +280,22 @@ class Env:
             prefix = "physics/"
             load_extra({k[len(prefix) :]: v for k, v in moved.items() if k.startswith(prefix)})
         self.view.clock, self.age = moved["clock"].clone(), moved["age"].clone()
-        self.generator.set_state(moved["generator"].cpu())
         self.memory = {k[7:]: v for k, v in moved.items() if k.startswith("memory/")}
+        self._load_stock({k[6:]: v for k, v in moved.items() if k.startswith("stock/")})
+        self.generator.set_state(moved["generator"].cpu())
         self.view.curriculum = {k[11:]: v for k, v in moved.items() if k.startswith("curriculum/")}
         self.view.refresh()
         return self._observe()
+
+    def _load_stock(self, state: dict[str, Tensor]) -> None:
+        """Draws the stock of :meth:`state_dict` again."""
+        self._stock = None
+        if state and self._stocks:
+            self.generator.set_state(state["generator"].cpu())
+            of = "curriculum/"
+            self.view.curriculum = {k[len(of) :]: v for k, v in state.items() if k.startswith(of)}
+            self._stock = self._prepare()
+            self._stock.used = state["used"].clone()
 
     def close(self) -> None:
         """Frees the engine."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from sports.frames import Heading
 from sports.humanoid.body import Body
-from sports.physics.base import Geometry, Physics, PhysicsState, SomeWorlds
+from sports.physics.base import Geometry, Physics, PhysicsState
 from sports.scene import Scene
 
 Memory = dict[str, Tensor]
@@ -45,17 +45,6 @@ class View:
     def refresh(self) -> None:
         """Tells the view that the engine's tensors have changed."""
         self._heading = self._pressure = None
-
-    def of(self, worlds: Tensor) -> View:
-        """The view of some worlds, by index (n,)."""
-        return replace(
-            self,
-            physics=SomeWorlds(self.physics, worlds),
-            curriculum={k: v[worlds] for k, v in self.curriculum.items()},
-            clock=self.clock[worlds],
-            _heading=None,
-            _pressure=None,
-        )
 
     @property
     def heading(self) -> Heading:
@@ -126,8 +115,8 @@ class Advance:
 class Task:
     """A sport, as data and functions. All functions are batched, pure and engine-free.
 
-    A row of their results depends on that row alone: ``begin`` and ``features`` are also called
-    with those worlds only that have just been reset.
+    A row of their results depends on that row alone. Starts may be drawn ahead of need, with
+    ``begin`` and ``features`` called on a view that shows them.
     """
 
     name: str

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -105,30 +105,6 @@ class Physics(Protocol):
     def close(self) -> None:
         """Frees threads and device memory."""
         ...
-
-
-class SomeWorlds:
-    """Some worlds of an engine, by index: copies of its tensors' rows, to look at."""
-
-    def __init__(self, physics: Physics, worlds: Tensor) -> None:
-        self._physics, self._worlds = physics, worlds
-        self.num_worlds = worlds.shape[0]
-
-    def __getattr__(self, name: str) -> Any:
-        value = getattr(self._physics, name)
-        if isinstance(value, Tensor) and value.dim() > 0:
-            value = value[self._worlds]
-            setattr(self, name, value)
-        return value
-
-    def extent(self, direction: Tensor) -> Tensor:
-        return self._physics.extent(direction)[self._worlds]
-
-    def step(self, ctrl: Tensor) -> None:
-        raise NotImplementedError("only the whole engine can step")
-
-    def reset(self, mask: Tensor, state: PhysicsState) -> None:
-        raise NotImplementedError("only the whole engine can reset")
 
 
 def default_state(scene: Scene, num_worlds: int, device: torch.device | str) -> PhysicsState:

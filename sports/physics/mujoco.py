@@ -17,7 +17,7 @@ from torch import Tensor
 from sports.humanoid.mjcf import build_model
 from sports.physics.base import Geometry, PhysicsState, default_state, diverged
 from sports.physics.kinematics import Kinematics
-from sports.physics.results import Display, Motion, Results
+from sports.physics.results import Display, Results, Shown
 from sports.physics.variation import Variation, draw
 from sports.physics.worlds import Worlds
 from sports.scene import Scene
@@ -42,7 +42,7 @@ class MujocoPhysics:
         self.threads = threads = threads or os.cpu_count() or 1
         self.device = torch.device("cpu")
         self.model = model = build_model(scene)
-        kinematics = Kinematics(model, scene.body)
+        self._kinematics = kinematics = Kinematics(model, scene.body)
         self.geometry = Geometry(scene.body, self.device)
         out = Results.zeros(scene, n)
         drawn = None
@@ -55,17 +55,21 @@ class MujocoPhysics:
             worlds = Worlds(scene, model, kinematics, native, out.of(rows), own)
             self._parts.append((rows, worlds))
         self._pool = ThreadPoolExecutor(len(self._parts), "mujoco")
-        self.qpos, self.qvel = torch.from_numpy(out.qpos), torch.from_numpy(out.qvel)
-        self.mocap_pos = torch.from_numpy(out.mocap_pos)
-        self.body_pos, self.body_quat, self.body_linvel, self.body_angvel = _tensors(out.links)
-        self.felt = torch.from_numpy(out.felt).permute(2, 0, 1)
-        self.body_rot = torch.from_numpy(out.rotation).permute(4, 2, 3, 0, 1)
-        self.object_pos, self.object_quat, self.object_linvel, self.object_angvel = _tensors(
-            out.objects
+        shown = Shown(scene, self.geometry, out)
+        self.qpos, self.qvel, self.mocap_pos = shown.qpos, shown.qvel, shown.mocap_pos
+        self.body_pos, self.body_quat, self.body_rot = (
+            shown.body_pos,
+            shown.body_quat,
+            shown.body_rot,
         )
-        shape = (scene.num_agents, scene.body.num_links)
-        self.ground_force = _turned(out.ground_force).unflatten(1, shape)
-        self.pair_force = torch.from_numpy(out.pair_force).T
+        self.body_linvel, self.body_angvel, self.felt = (
+            shown.body_linvel,
+            shown.body_angvel,
+            shown.felt,
+        )
+        self.object_pos, self.object_quat = shown.object_pos, shown.object_quat
+        self.object_linvel, self.object_angvel = shown.object_linvel, shown.object_angvel
+        self.ground_force, self.pair_force = shown.ground_force, shown.pair_force
         self.bad = torch.zeros(n, dtype=torch.bool)
         self.nan_worlds = 0
         self.overflow = 0
@@ -82,15 +86,32 @@ class MujocoPhysics:
 
     def reset(self, mask: Tensor, state: PhysicsState) -> None:
         ids = np.flatnonzero(mask.numpy())
-        if not ids.size:
-            return
-        qpos, qvel, mocap = state.qpos.numpy(), state.qvel.numpy(), state.mocap_pos.numpy()
-        for rows, worlds in self._parts:
-            own = ids[(ids >= rows.start) & (ids < rows.stop)]
-            worlds.put(own - rows.start, qpos[own], qvel[own], mocap[own])
-        self._display.state(ids, qpos[ids], qvel[ids], mocap[ids])
-        self._out.ground_force[..., ids] = 0.0
-        self._out.pair_force[..., ids] = 0.0
+        if ids.size:
+            rows = [x.numpy()[ids] for x in (state.qpos, state.qvel, state.mocap_pos)]
+            self._put(ids, *rows)
+            self._display.state(ids, *rows)
+            self._out.ground_force[..., ids] = 0.0
+            self._out.pair_force[..., ids] = 0.0
+
+    def prepare(self, state: PhysicsState) -> Shown:
+        """What every world would show after a reset to its row of ``state``, for ``restart``:
+        for all together this costs little more than for a few."""
+        out = Results.zeros(self.scene, self.num_worlds)
+        arrays = (x.numpy() for x in (state.qpos, state.qvel, state.mocap_pos))
+        Display(self.scene, self._kinematics, out).state(slice(None), *arrays)
+        return Shown(self.scene, self.geometry, out)
+
+    def restart(self, worlds: Tensor, prepared: Shown) -> None:
+        """Resets worlds (n,), by index, to what was prepared."""
+        ids, out = worlds.numpy(), prepared.results
+        self._put(ids, out.qpos[ids], out.qvel[ids], out.mocap_pos[ids])
+        self._out.take(ids, out)
+
+    def _put(self, ids: np.ndarray, *rows: np.ndarray) -> None:
+        """States (n, ...) of worlds, not yet shown."""
+        for part, worlds in self._parts:
+            own = (ids >= part.start) & (ids < part.stop)
+            worlds.put(ids[own] - part.start, *(x[own] for x in rows))
 
     def extent(self, direction: Tensor) -> Tensor:
         return self.geometry.extent(self.body_pos, self.body_quat, direction)
@@ -140,17 +161,3 @@ def _share_out(num_worlds: int, threads: int) -> list[tuple[slice, int]]:
     first = threads // 2
     split = max(1, num_worlds * first // threads)
     return [(slice(0, split), first), (slice(split, num_worlds), threads - first)]
-
-
-def _turned(array: np.ndarray) -> Tensor:
-    """(N, ..., k) tensor over an array (k, ..., N)."""
-    return torch.from_numpy(array).movedim((-1, 0), (0, -1))
-
-
-def _tensors(motion: Motion) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return (
-        _turned(motion.pos),
-        _turned(motion.quat),
-        _turned(motion.linvel),
-        _turned(motion.angvel),
-    )

@@ -9,8 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from sports.frames import fill_proprioception
+from sports.physics.base import Geometry
 from sports.physics.kinematics import Kinematics, Pose
 from sports.physics.vectors import rotation
 from sports.scene import Scene
@@ -94,6 +97,45 @@ class Results:
             self.ground_force[..., worlds],
             self.pair_force[..., worlds],
         )
+
+    def take(self, worlds: np.ndarray, other: Results) -> None:
+        """Copies the rows of some worlds, by index."""
+        for mine, theirs in zip(self._worlds_last(), other._worlds_last()):
+            mine[..., worlds] = theirs[..., worlds]
+
+    def _worlds_last(self) -> list[np.ndarray]:
+        """Views of all arrays with the worlds in the last axis."""
+        state = [self.qpos.T, self.qvel.T, self.mocap_pos.T]
+        motion = [getattr(m, f.name) for m in (self.links, self.objects) for f in fields(m)]
+        return [*state, *motion, self.rotation, self.felt, self.ground_force, self.pair_force]
+
+
+class Shown:
+    """Results as the tensors of ``Physics``: views of the same memory."""
+
+    def __init__(self, scene: Scene, geometry: Geometry, results: Results) -> None:
+        self.scene, self.geometry, self.results = scene, geometry, results
+        self.num_worlds = len(results.qpos)
+        self.qpos, self.qvel = torch.from_numpy(results.qpos), torch.from_numpy(results.qvel)
+        self.mocap_pos = torch.from_numpy(results.mocap_pos)
+        links, objects = results.links, results.objects
+        self.body_pos, self.body_quat = _turned(links.pos), _turned(links.quat)
+        self.body_linvel, self.body_angvel = _turned(links.linvel), _turned(links.angvel)
+        self.body_rot = torch.from_numpy(results.rotation).permute(4, 2, 3, 0, 1)
+        self.felt = torch.from_numpy(results.felt).permute(2, 0, 1)
+        self.object_pos, self.object_quat = _turned(objects.pos), _turned(objects.quat)
+        self.object_linvel, self.object_angvel = _turned(objects.linvel), _turned(objects.angvel)
+        agents = (scene.num_agents, scene.body.num_links)
+        self.ground_force = _turned(results.ground_force).unflatten(1, agents)
+        self.pair_force = torch.from_numpy(results.pair_force).T
+
+    def extent(self, direction: Tensor) -> Tensor:
+        return self.geometry.extent(self.body_pos, self.body_quat, direction)
+
+
+def _turned(array: np.ndarray) -> Tensor:
+    """(N, ..., k) tensor over an array (k, ..., N)."""
+    return torch.from_numpy(array).movedim((-1, 0), (0, -1))
 
 
 class Display:
