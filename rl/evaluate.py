@@ -24,8 +24,9 @@ from rl import provenance
 from rl.host import one_torch_thread
 from rl.policy import Policy, load_policy
 from rl.recording import Recording, Tape
-from sports.env import START_NOISE, Env, Starts, make_env, make_scene
+from sports.env import Env, Starts, make_env, make_scene
 from sports.registry import get_task
+from sports.starts import START_NOISE
 
 __all__ = ["EvaluationResult", "Recording", "evaluate", "interval"]
 

@@ -108,6 +108,7 @@ class Env:
         """Resets every world; (N, A, obs)."""
         everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
         self._reset(everyone)
+        self._stock = None
         if self.training and self.task.age_at_start:
             # Once, so that worlds do not all reach the time limit together.
             draw = torch.rand(self.num_worlds, device=self.device, generator=self.generator)
@@ -187,7 +188,7 @@ class Env:
         """Resets worlds, by index, from the stock; ``obs`` with their new rows."""
         stock = self._stock
         if stock is None or not stock.serves(worlds, self.curriculum):
-            stock = self._stock = self._prepare()
+            stock = self._stock = self._prepare(*self._draw())
         stock.used[worlds] = True
         cast(Any, self.physics).restart(worlds, stock.shown)
         self.view.clock = self.view.clock.index_fill(0, worlds, 0)
@@ -198,19 +199,18 @@ class Env:
         }
         return obs.index_copy(0, worlds, stock.obs[worlds])
 
-    def _prepare(self) -> Stock:
-        generator = self.generator.get_state()
-        state, context = self._draw()
+    def _prepare(self, state: PhysicsState, context: Memory) -> Stock:
         shown = cast(Any, self.physics).prepare(state)
         view = dataclasses.replace(self.view, physics=shown)
         view.refresh()
         fresh = self.task.begin(view, context)
         return Stock(
+            state=state,
+            context=context,
             shown=shown,
             memory={k: v.to(self.memory[k].dtype) for k, v in fresh.items()},
             obs=self._observe(view, fresh),
             curriculum=dict(self.curriculum),
-            generator=generator,
             used=torch.zeros(self.num_worlds, dtype=torch.bool),
         )
 
@@ -271,7 +271,7 @@ class Env:
         """
         if "qpos" not in state or state["qpos"].shape != self.physics.qpos.shape:
             raise ValueError("the environment state is of another task or number of worlds")
-        moved = {k: v if "generator" in k else v.to(self.device) for k, v in state.items()}
+        moved = {k: v if k == "generator" else v.to(self.device) for k, v in state.items()}
         everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
         physics_state = PhysicsState(moved["qpos"], moved["qvel"], moved["mocap_pos"])
         self.physics.reset(everyone, physics_state)
@@ -280,7 +280,7 @@ class Env:
             prefix = "physics/"
             load_extra({k[len(prefix) :]: v for k, v in moved.items() if k.startswith(prefix)})
         self.view.clock, self.age = moved["clock"].clone(), moved["age"].clone()
-        self.memory = {k[7:]: v for k, v in moved.items() if k.startswith("memory/")}
+        self.memory = {k[7:]: v.clone() for k, v in moved.items() if k.startswith("memory/")}
         self._load_stock({k[6:]: v for k, v in moved.items() if k.startswith("stock/")})
         self.generator.set_state(moved["generator"].cpu())
         self.view.curriculum = {k[11:]: v for k, v in moved.items() if k.startswith("curriculum/")}
@@ -288,14 +288,18 @@ class Env:
         return self._observe()
 
     def _load_stock(self, state: dict[str, Tensor]) -> None:
-        """Draws the stock of :meth:`state_dict` again."""
+        """Works the stock of :meth:`state_dict` out again."""
         self._stock = None
-        if state and self._stocks:
-            self.generator.set_state(state["generator"].cpu())
-            of = "curriculum/"
-            self.view.curriculum = {k[len(of) :]: v for k, v in state.items() if k.startswith(of)}
-            self._stock = self._prepare()
-            self._stock.used = state["used"].clone()
+        if not state or not self._stocks:
+            return
+
+        def part(prefix: str) -> Memory:
+            return {k[len(prefix) :]: v.clone() for k, v in state.items() if k.startswith(prefix)}
+
+        start = PhysicsState(*(state[k].clone() for k in ("qpos", "qvel", "mocap_pos")))
+        self.view.curriculum = part("curriculum/")
+        self._stock = self._prepare(start, part("context/"))
+        self._stock.used = state["used"].clone()
 
     def close(self) -> None:
         """Frees the engine."""

@@ -60,15 +60,16 @@ class Stock:
     """A start of an episode for every world, worked out for all of them at once: ready when the
     world needs it, which saves two thirds of the time that a few resets in each step cost."""
 
+    state: PhysicsState
+    context: Memory
+    """Of ``Task.begin``."""
     shown: Any
-    """The engine's."""
+    """The engine's, of the state."""
     memory: Memory
     obs: Tensor
     """(N, A, obs)"""
     curriculum: Memory
     """That it was drawn for."""
-    generator: Tensor
-    """State of the generator from which it was drawn."""
     used: Tensor
     """(N,) bool: each start serves once."""
 
@@ -80,6 +81,7 @@ class Stock:
         return same and not bool(self.used[worlds].any())
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What it can be drawn from again."""
-        drawn_for = {f"curriculum/{k}": v.clone() for k, v in self.curriculum.items()}
-        return {"generator": self.generator, "used": self.used.clone(), **drawn_for}
+        """What it can be worked out from again."""
+        state = {k: v.clone() for k, v in vars(self.state).items()} | {"used": self.used.clone()}
+        state |= {f"context/{k}": v.clone() for k, v in self.context.items()}
+        return state | {f"curriculum/{k}": v.clone() for k, v in self.curriculum.items()}
