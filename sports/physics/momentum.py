@@ -17,8 +17,10 @@ Momentum is taken at the centre of mass, world axes: ``(L, P)``, N m s and N s.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 GRAVITY = np.array((0.0, 0.0, -9.81))
@@ -99,7 +101,7 @@ class MomentumKeeper:
         self.path = np.full((num_worlds, 3), np.nan)
         """(N, 3) where the centre of mass should be in that state; NaN where unknown."""
 
-    def forget(self, ids: np.ndarray) -> None:
+    def forget(self, ids: np.ndarray | slice) -> None:
         """The next measurement of these worlds is taken as it is (after a reset)."""
         self.target[ids] = np.nan
         self.path[ids] = np.nan
@@ -146,3 +148,99 @@ class MomentumKeeper:
             axis=1,
         )
         return twist, change, shift
+
+
+class AthleteKeeper:
+    """Keeps the momentum of one athlete of N simulations of a plain MuJoCo model.
+
+    The model needs the athlete's two momentum sensors, as ``mjcf.build_spec`` adds them; its
+    contact sensors may be deleted. Works on a batch and, with one row, on an ``MjData``::
+
+        keeper = AthleteKeeper(model, batch.bind, "agent0/Pelvis")
+        keeper = AthleteKeeper(model, rows_of(data), "agent0/Pelvis")
+
+    Call :meth:`correct` after every single substep: with ``current`` false after a plain
+    ``batch.step()`` or ``mj_step``, with ``current`` true after ``batch.step(stage=mjSTAGE_VEL)``
+    (or ``mj_step`` and ``mj_step1``'s stages again), which the last substep before the links are
+    read wants. It writes ``qpos`` and ``qvel``. Links read after a ``current`` correction were
+    computed before it: add the returned shift to their positions, the twist to ``cvel``. Call
+    :meth:`forget` for simulations whose state was set from outside.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        bind: Callable[[str], np.ndarray],
+        root: str,
+        num_worlds: int | None = None,
+    ) -> None:
+        """
+        Args:
+            model: its time step and the mass of the root's subtree are used.
+            bind: gives a live (N, ...) array of an MjData field; ``Batch.bind`` or ``rows_of``.
+            root: name of the athlete's root body, the one with the free joint.
+            num_worlds: keep the first so many simulations; None for all.
+
+        Raises:
+            ValueError: the model has no such body, or lacks its momentum sensors.
+        """
+        names = [model.sensor(i).name for i in range(model.nsensor)]
+        missing = [s for s in (f"angmom:{root}", f"linvel:{root}") if s not in names]
+        if missing:
+            raise ValueError(f"the model has no sensor '{missing[0]}'; see sports.humanoid.mjcf")
+        body = model.body(root)
+        q, v = model.jnt_qposadr[body.jntadr[0]], model.jnt_dofadr[body.jntadr[0]]
+        spin, speed = (model.sensor(f"{k}:{root}").adr[0] for k in ("angmom", "linvel"))
+        n = slice(num_worlds)
+        self._pos, self._vel = bind("qpos")[n, q : q + 3], bind("qvel")[n, v : v + 6]
+        self._inertia = bind("crb")[n, body.id, :6]
+        self._angular = bind("sensordata")[n, spin : spin + 3]
+        self._velocity = bind("sensordata")[n, speed : speed + 3]
+        self._com = bind("subtree_com")[n, body.id]
+        self._root_pos, self._root_quat = bind("xpos")[n, body.id], bind("xquat")[n, body.id]
+        self._root_force = bind("qfrc_constraint")[n, v : v + 6]
+        mass = float(model.body_subtreemass[body.id])
+        self.expected = MomentumKeeper(len(self._pos), mass, model.opt.timestep)
+        """The momentum and the path expected, and the time step."""
+
+    def forget(self, worlds: np.ndarray | slice = slice(None)) -> None:
+        """The next measurement of these simulations is taken as it is."""
+        self.expected.forget(worlds)
+
+    def measured(self) -> np.ndarray:
+        """(N, 9) as the fields show it: centre of mass (m), its velocity (m/s), angular momentum
+        about it (N m s); world frame. For a single ``MjData``, valid after ``mj_forward``."""
+        return np.concatenate((self._com, self._velocity, self._angular), axis=1)
+
+    def whole(self) -> np.ndarray:
+        """(N, 9) the same as :meth:`measured`, of the state as a ``current`` :meth:`correct` has
+        left it."""
+        momentum = self.expected.target
+        speed = momentum[:, 3:] / self.expected.mass
+        return np.concatenate((self.expected.path, speed, momentum[:, :3]), axis=1)
+
+    def correct(self, current: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Corrects the state after a substep; see the class.
+
+        Returns (N, 6) the added spatial velocity (rotation, then velocity of the centre of mass,
+        as ``cvel``; world) and (N, 3) the shift of the whole athlete.
+        """
+        tree = Tree(
+            inertia=self._inertia,
+            angular=self._angular,
+            velocity=self._velocity,
+            com=self._com,
+            root_pos=self._root_pos,
+            root_quat=self._root_quat,
+            root_force=self._root_force,
+        )
+        with np.errstate(all="ignore"):  # a simulation may have diverged
+            twist, change, shift = self.expected.correct(tree, current)
+            self._vel += change
+            self._pos += shift
+        return twist, shift
+
+
+def rows_of(data: mujoco.MjData) -> Callable[[str], np.ndarray]:
+    """Live arrays of one ``MjData`` as those of a batch of one, for :class:`AthleteKeeper`."""
+    return lambda name: getattr(data, name)[None]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sports.humanoid.mjcf import body_name, build_model
 from sports.physics.base import Geometry, PhysicsState, default_state, diverged
-from sports.physics.momentum import MomentumKeeper, Tree
+from sports.physics.momentum import AthleteKeeper
 from sports.physics.variation import Draw, Variation, draw
 from sports.quaternion import cross
 from sports.scene import Scene
@@ -48,7 +48,6 @@ class MujocoPhysics:
         self._xpos, self._xquat, self._cvel = bind("xpos"), bind("xquat"), bind("cvel")
         self._com, self._sensors = bind("subtree_com"), bind("sensordata")
         self._warmstart = bind("qacc_warmstart")
-        self._crb, self._constraint = bind("crb"), bind("qfrc_constraint")
 
         agents, links = scene.num_agents, scene.body.num_links
         self._ids = np.array(
@@ -76,7 +75,8 @@ class MujocoPhysics:
         self.nan_worlds = 0
         self.overflow = 0
         self._forces = np.zeros((n, self._num_ground + len(scene.contact_pairs), 3))
-        self._keepers = [MomentumKeeper(n, scene.body.mass, scene.timestep) for _ in range(agents)]
+        roots = [body_name(a, scene.body.link_names[0]) for a in range(agents)]
+        self._keepers = [AthleteKeeper(model, bind, root) for root in roots]
         self._twist, self._shift = np.zeros((n, agents, 6)), np.zeros((n, agents, 3))
         self._timesteps: list[np.ndarray] | None = None
         if variation is not None:
@@ -109,8 +109,7 @@ class MujocoPhysics:
             if self._timesteps is not None:
                 self._timestep[:] = self._timesteps[i].reshape(self._timestep.shape)
             self.batch.step(stage=_VEL if last else 0)
-            with np.errstate(all="ignore"):  # diverged worlds, found below
-                self._keep_momentum(i, last)
+            self._keep_momentum(i, last)
             now = self._sensors.reshape(self.num_worlds, -1, 3)[:, : self._forces.shape[1]]
             norm = np.einsum("nsi,nsi->ns", now, now)
             more = norm > largest
@@ -128,25 +127,10 @@ class MujocoPhysics:
 
     def _keep_momentum(self, substep: int, last: bool) -> None:
         """Undoes the integrator's drift of every athlete's momentum; see ``momentum.py``."""
-        forces = self._num_ground + len(self.scene.contact_pairs)
-        sensors = self._sensors.reshape(self.num_worlds, -1, 3)[:, forces:]
         for agent, keeper in enumerate(self._keepers):
             if self._timesteps is not None:
-                keeper.timestep = self._timesteps[substep]
-            root = self._ids[agent, 0]
-            v, q = self.scene.agent_qvel(agent).start, self.scene.agent_qpos(agent).start
-            tree = Tree(
-                inertia=self._crb[:, root, :6],
-                angular=sensors[:, 2 * agent],
-                velocity=sensors[:, 2 * agent + 1],
-                com=self._com[:, root],
-                root_pos=self._xpos[:, root],
-                root_quat=self._xquat[:, root],
-                root_force=self._constraint[:, v : v + 6],
-            )
-            twist, change, shift = keeper.correct(tree, current=last)
-            self._qvel[:, v : v + 6] += change
-            self._qpos[:, q : q + 3] += shift
+                keeper.expected.timestep = self._timesteps[substep]
+            twist, shift = keeper.correct(current=last)
             if last:
                 self._twist[:, agent] = twist
                 self._shift[:, agent] = shift
@@ -179,8 +163,8 @@ class MujocoPhysics:
             "qpos": torch.from_numpy(self._qpos.copy()),
             "qvel": torch.from_numpy(self._qvel.copy()),
             "qacc_warmstart": torch.from_numpy(self._warmstart.copy()),
-            "target": torch.from_numpy(np.stack([k.target for k in self._keepers])),
-            "path": torch.from_numpy(np.stack([k.path for k in self._keepers])),
+            "target": torch.from_numpy(np.stack([k.expected.target for k in self._keepers])),
+            "path": torch.from_numpy(np.stack([k.expected.path for k in self._keepers])),
         }
 
     def load_extra_state(self, state: dict[str, Tensor]) -> None:
@@ -188,7 +172,8 @@ class MujocoPhysics:
         self._qpos[:], self._qvel[:] = state["qpos"].numpy(), state["qvel"].numpy()
         self._warmstart[:] = state["qacc_warmstart"].numpy()
         for i, keeper in enumerate(self._keepers):
-            keeper.target, keeper.path = state["target"][i].numpy(), state["path"][i].numpy()
+            keeper.expected.target[:] = state["target"][i].numpy()
+            keeper.expected.path[:] = state["path"][i].numpy()
         self.batch.forward(stage=_VEL)
         self._read()
 

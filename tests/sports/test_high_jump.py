@@ -179,7 +179,7 @@ def test_levels_of_ones_own():
     drawn = env.memory["bar_height"].unique().tolist()
     assert drawn == pytest.approx([0.4, 0.6, 0.9])
     for bad in ([], [0.9, 0.6], [0.5, 0.5], [0.0], [9.0]):
-        with pytest.raises(ValueError, match="bar must be|levels must rise"):
+        with pytest.raises(ValueError, match=r"bar must be|levels must rise"):
             make_config(get_task("high_jump"), {"levels": bad})
     with pytest.raises(ValueError, match="not be negative"):
         make_config(get_task("high_jump"), {"cleared": -1.0})
