@@ -24,10 +24,14 @@ from warmstart.solution import Solution
 from warmstart.transcription import Transcription
 
 LINE_X = 20.0
-CARRY = 0.14
+CARRY = 0.10
 """The centre of mass lands behind the length by at most its forward speed times this (s): an
 athlete further back sits down before the marks have stopped counting, 0.3 s later."""
 
+TOUCH = 0.003
+"""Height (m) at which the right heel has landed."""
+RATE = jumper.RATE | {"L_Shoulder_z": (-12.0, 12.0), "R_Shoulder_z": (-12.0, 12.0)}
+"""Rate boxes (m/s, rad/s): a hand does not pass through a thigh between two knots."""
 FOOT_SPEED, LIFT = 3.0, 0.8
 """Before its impact the take-off foot comes down at most so fast (m/s), and the impact gives the
 centre of mass at most so much upward speed (m/s): a quarter of the athlete, the distal mass of
@@ -90,7 +94,7 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
         body,
         model,
         phases,
-        Bounds(position, jumper.boxes(jumper.RATE), acceleration=2000.0, hinge_rate=30.0),
+        Bounds(position, jumper.boxes(RATE), acceleration=2000.0, hinge_rate=30.0),
         held_limits=jumper.HELD_LIMITS,
         flight_limits=jumper.FLIGHT_LIMITS,
         parameters=1,
@@ -127,7 +131,10 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
             motion.point(model.tree.link(b.link), b.center) - ca.vertcat(LINE_X + p[0], 0, 0)
             for b in left + right
         ]
-        tops = [motion.point(model.tree.link(b.link), b.center)[2] for b in upper]
+        tops = [
+            motion.point(model.tree.link(b.link), b.center) - ca.vertcat(LINE_X + p[0], 0, 0)
+            for b in upper
+        ]
         heels = [
             s
             for s, b in zip(soles, left + right, strict=True)
@@ -135,10 +142,10 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
         ]
         com, velocity = center_of_mass(model.tree, motion)
         return [
-            ("soles over the pit", ca.vertcat(*[s[2] for s in soles], *tops), 0.0, np.inf),
-            ("heels down", ca.vertcat(*[h[2] for h in heels]), 0.0, 0.03),
+            ("feet over the pit", ca.vertcat(*[s[2] for s in soles + tops]), 0.0, np.inf),
+            ("heels down", ca.vertcat(*[h[2] for h in heels]), 0.0, [0.03, 0.03, TOUCH, TOUCH]),
             ("heels at the length", ca.vertcat(*[h[0] for h in heels]), 0.0, 0.12),
-            ("toes beyond the length", ca.vertcat(*[s[0] for s in soles]), 0.0, np.inf),
+            ("feet beyond the length", ca.vertcat(*[s[0] for s in soles + tops]), 0.0, np.inf),
             ("body behind the feet", LINE_X + p[0] - com[0], -0.2, 0.75),
             ("carried forward", velocity[0], 1.5, np.inf),
             ("carried over the feet", LINE_X + p[0] - com[0] - CARRY * velocity[0], -np.inf, 0.0),
@@ -146,8 +153,8 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
         ]
 
     program.rows("landing", [program.K - 1], land, rates=True)
-    for name in ("roll", "yaw"):
-        program.bound(program.q[-1, model.index(name)], -0.4, 0.4)
+    for name, low, high in (("pitch", -0.1, 1.0), ("roll", -0.4, 0.4), ("yaw", -0.4, 0.4)):
+        program.bound(program.q[-1, model.index(name)], low, high)
     return program
 
 
