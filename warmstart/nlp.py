@@ -30,7 +30,8 @@ class Block:
     upper: np.ndarray
     row_names: tuple[str, ...]
     value: ca.Function
-    gradient: ca.Function
+    gradient: ca.Function | None
+    """None where the block adds nothing to the cost."""
     jacobian: ca.Function
     hessian: ca.Function
 
@@ -126,6 +127,7 @@ class Program:
         f = ca.SX(cost)
         lam_f, lam_g = ca.SX.sym("lam_f"), ca.SX.sym("lam_g", g.numel())
         gradient = ca.densify(ca.gradient(f, y))
+        costs = not gradient.is_zero()
         lagrangian = lam_f * f + ca.dot(lam_g, g)
         hessian = ca.triu(ca.hessian(lagrangian, y)[0])
         empty = np.zeros((instances, 0))
@@ -138,7 +140,7 @@ class Program:
                 upper=np.hstack(upper) if upper else empty,
                 row_names=tuple(names),
                 value=ca.Function("value", [y, p], [f, ca.densify(g)]),
-                gradient=ca.Function("gradient", [y, p], [gradient]),
+                gradient=ca.Function("gradient", [y, p], [gradient]) if costs else None,
                 jacobian=ca.Function("jacobian", [y, p], [ca.jacobian(g, y)]),
                 hessian=ca.Function("hessian", [y, p, lam_f, lam_g], [hessian]),
             )
@@ -173,7 +175,7 @@ class Program:
             costs, values = b.value.map(instances)(x_b, p_b)
             f += ca.sum2(costs)
             g.append(ca.vec(values))
-            if b.gradient.n_instructions() > b.index.shape[1] + 1:  # else the cost is constant
+            if b.gradient is not None:
                 gradient.append(ca.vec(b.gradient.map(instances)(x_b, p_b)))
                 gradient_of.append(b.index.ravel())
             row_of = start + np.arange(count).reshape(instances, b.rows)

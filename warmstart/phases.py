@@ -57,6 +57,9 @@ class Bounds:
     position: Mapping[str, tuple[float, float]]
     rate: Mapping[str, tuple[float, float]]
     acceleration: float = 400.0
+    """Largest acceleration of any coordinate (m/s^2, rad/s^2)."""
+    hinge_rate: float = 20.0
+    """Largest rate of a coordinate without a box of its own (rad/s)."""
     friction_x: float = 0.8
     """|f_x| <= friction_x f_z; with friction_y inside the circle of the ground's mu = 1."""
     friction_y: float = 0.5

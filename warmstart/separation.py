@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 ALLOWED = 0.002
 """How far (m) a limb may reach over its border. The certificate allows two limbs 0.02 m, but a
 foot is longer than the ball that stands for it."""
-CORNERS = 0.04
-"""How much further (m) a hand keeps from a foot: corners stick out of the balls in both boxes."""
+CORNERS = 0.02
+"""How much further (m) a hand keeps from a leg, and twice that from a foot: the corners of a box
+stick out of its ball."""
 LEG = ("Hip", "Knee", "Ankle", "Toe")
 HAND = ("Wrist", "Hand")
 
@@ -52,15 +53,16 @@ def axis_balls(body: Body, link: str, count: int = 2) -> list[Ball]:
 
 
 def keep_apart(program: Transcription, body: Body, knots: Sequence[int] | np.ndarray) -> None:
-    """Adds the rows at knots: legs and hands on their sides, hands off the legs (46 a knot)."""
+    """Adds the rows at knots: legs and hands on their sides, hands off the legs (50 a knot)."""
     import casadi as ca
 
     model = program.model
     hands = {s: [axis_balls(body, f"{s}_{n}")[-1] for n in HAND] for s in "LR"}
     own = {s: [b for n in LEG for b in axis_balls(body, f"{s}_{n}")] + hands[s] for s in "LR"}
-    # The upper ends of thigh and shin are covered by their neighbours.
+    # The upper end of a shin is covered by the thigh.
     lifted = {
-        s: [b for n in ("Hip", "Knee") for b in axis_balls(body, f"{s}_{n}", 3)[1:]]
+        s: axis_balls(body, f"{s}_Hip", 3)
+        + axis_balls(body, f"{s}_Knee", 3)[1:]
         + [b for n in ("Ankle", "Toe") for b in axis_balls(body, f"{s}_{n}")]
         for s in "LR"
     }
@@ -85,7 +87,7 @@ def keep_apart(program: Transcription, body: Body, knots: Sequence[int] | np.nda
         for side in "LR":
             for a in hands[side]:
                 for b in lifted[side]:
-                    corners = CORNERS if b.link.endswith(("Ankle", "Toe")) else 0.0
+                    corners = CORNERS * (2 if b.link.endswith(("Ankle", "Toe")) else 1)
                     reach = a.radius + b.radius + corners - ALLOWED
                     gaps.append(ca.sumsqr(at(motion, a) - at(motion, b)) - reach**2)
         return [("hands off the legs", ca.vertcat(*gaps) / 0.05, 0.0, np.inf)]

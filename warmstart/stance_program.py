@@ -132,7 +132,7 @@ class StanceProgram:
             prog.AddBoundingBoxConstraint(self.q_ref[k], self.q_ref[k], self.q[k])
             prog.AddBoundingBoxConstraint(rate, rate, self.v[k])
             prog.AddBoundingBoxConstraint(acceleration, acceleration, self.a[k])
-        positions, rates = self._box(self.bounds.position), self._box(self.bounds.rate, 20.0)
+        positions, rates = self._box(self.bounds.position), self._box(self.bounds.rate, self.bounds.hinge_rate)
         for k in range(1, K - 1):
             prog.AddBoundingBoxConstraint(*positions, self.q[k])
             prog.AddBoundingBoxConstraint(*(rate / RATE_SCALE for rate in rates), self.v[k])

@@ -52,6 +52,8 @@ class Transcription:
         self.weight = model.tree.total_mass * GRAVITY
         self.effort = model.tree.effort[model.free_index] * bounds.torque_share
         self.sides = tuple(s for s in "LR" if any(s in p.feet for p in phases))
+        self.before: np.ndarray | None = None
+        self.impulse: np.ndarray | None = None
         self._add_variables()
         self._add_dynamics()
         self._add_intervals()
@@ -108,7 +110,7 @@ class Transcription:
     def _add_variables(self) -> None:
         P, K, n = self.program, self.K, self.model.n
         self.q = P.variable((K, n), *self._box(self.bounds.position, 50.0), 1.0)
-        self.v = P.variable((K, n), *self._box(self.bounds.rate, 20.0), 5.0)
+        self.v = P.variable((K, n), *self._box(self.bounds.rate, self.bounds.hinge_rate), 5.0)
         limit = np.full(n, self.bounds.acceleration)
         self.a = P.variable((K, n), -limit, limit, 50.0)
         reach = self.effort * (ELASTIC_REACH if self.elastic else 1.0)
@@ -297,6 +299,52 @@ class Transcription:
                 self.fix(self.q[first, model.index(f"{side}_Toe_y")], 0.0)
             self.program.block(f"stance {side}", [self.q[held], self.v[held]], still)
 
+    def touch_down(self, side: str, foot_speed: float, lift: float) -> None:
+        """The first state follows from a plastic impact of a foot that comes down.
+
+        Adds the rates ``before`` (n,) and the ``impulse`` (6, 3) at the sole points (N s, world),
+
+            M (v[0] - before) = J' impulse
+
+        in the rows of the root and of the free hinges (held ones are held through the impact
+        too), the impulse inside the friction pyramid, every sole point coming down at no more
+        than ``foot_speed`` (m/s) before; the centre of mass gains at most ``lift`` (m/s) upward.
+        The foot stands still afterwards (contact rows), so the impact only takes energy
+        (Featherstone, Rigid Body Dynamics Algorithms, chapter 11).
+        """
+        model, points = self.model, sole_points(self.body, side)
+        mass = model.tree.total_mass
+        rates = self._box(self.bounds.rate, self.bounds.hinge_rate)
+        self.before = self.program.variable((model.n,), *rates, 5.0)
+        reach = 3.0 * mass
+        low = np.tile([-reach, -reach, 0.0], (6, 1))
+        self.impulse = self.program.variable((6, 3), low, reach, 0.3 * mass)
+        self.touching = side
+
+        def build(q, after, before, impulse, p):
+            f = ca.reshape(impulse, 3, len(points))
+            change = after - before
+            change[2] -= GRAVITY  # the recursion adds it
+            forces = [(model.tree.link(link), at, f[:, i]) for i, (link, at) in enumerate(points)]
+            tau = model.inverse_dynamics(q, None, change, forces)
+            motion = model.motion(q, before)
+            falling = [motion.point_velocity(model.tree.link(b), at)[2] for b, at in points]
+            fx, fy, fz = (f[i, :].T / mass for i in range(3))
+            mx, my = self.bounds.friction_x, self.bounds.friction_y
+            cone = ca.vertcat(fx - mx * fz, -fx - mx * fz, fy - my * fz, -fy - my * fz)
+            joints = tau[(6 + model.free_index).tolist()]
+            return 0.0, [
+                ("impulse", tau[:3] / mass, 0.0, 0.0),
+                ("turning impulse", tau[3:6] / (0.5 * mass), 0.0, 0.0),
+                ("joint impulse", joints / (0.05 * mass), 0.0, 0.0),
+                ("impulse friction", cone, -np.inf, 0.0),
+                ("lift", ca.sum1(fz), 0.0, lift),
+                ("foot comes down", ca.vertcat(*falling), -foot_speed, 0.0),
+            ]
+
+        inputs = [self.q[:1], self.v[:1], self.before[None], self.impulse[None]]
+        self.program.block(f"touch-down {side}", inputs, build)
+
     def rows(self, name: str, knots, build: Callable, rates: bool = False) -> None:
         """Rows on the positions (and rates) of knots: ``build(q[, v], p) -> [(row, ...)]``."""
         knots = np.atleast_1d(knots)
@@ -336,8 +384,14 @@ class Transcription:
                 active = self.mode_points(side, k)
                 for point in active:
                     x[index[point, 2]] = 2 * self.weight / len(active)
+        return self._guess_rest(x)
+
+    def _guess_rest(self, x: np.ndarray) -> np.ndarray:
+        """Fills in the variables that neither key poses nor a solution have."""
         if self.elastic:
             x[self.slack] = 1.0
+        if self.before is not None:
+            x[self.before] = x[self.v[0]]
         return x
 
     def guess_from(self, solution: Solution) -> np.ndarray:
@@ -368,8 +422,12 @@ class Transcription:
                 if point in points:
                     for k, index in self.f[side].items():
                         x[index[i]] = s["contact_force"][k, points[point]]
-        if self.elastic:
-            x[self.slack] = 1.0
+        self._guess_rest(x)
+        strike = solution.stats.get("touch_down")
+        if self.before is not None and strike:
+            qvel = np.array([strike["qvel"]])
+            _, v, _ = from_full_state(self.model, s["qpos"][:1], qvel, np.zeros_like(qvel))
+            x[self.before], x[self.impulse] = v[0], strike["impulse"]
         return x
 
     def times(self, x: np.ndarray) -> np.ndarray:
@@ -406,6 +464,21 @@ class Transcription:
             for k, index in self.f[side].items():
                 out[k, 6 * i : 6 * i + 6] = x[index]
         return out
+
+    def _touch_down_stats(self, x: np.ndarray) -> dict[str, object]:
+        """The rates before the touch-down (qvel) and the impulse at the sole points (N s)."""
+        if self.before is None or self.impulse is None:
+            return {}
+        q, v = x[self.q[:1]], x[self.before][None]
+        _, qvel, _ = to_full_state(self.model, q, v, np.zeros_like(v))
+        impulse = x[self.impulse]
+        return {
+            "touch_down": {
+                "side": self.touching,
+                "qvel": qvel[0].tolist(),
+                "impulse": impulse.tolist(),
+            }
+        }
 
     def solution(
         self, problem: str, asked: dict[str, float], result: Result, **stats: object
@@ -444,6 +517,7 @@ class Transcription:
                 "status": result.status,
                 "variables": len(self.program.lower),
                 "weights": asdict(self.weights),
+                **self._touch_down_stats(x),
                 **stats,
             },
         )

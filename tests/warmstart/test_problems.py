@@ -40,11 +40,12 @@ def test_block_derivatives_agree_with_one_big_graph():
 
     program.block("interval", [x[:-1], x[1:], np.repeat(h[None], 4, 0)], build, data)
     program.block("ends", [x[[0, -1]]], lambda e, p: (e[0] ** 2 * e[1], [("s", ca.exp(e), -9, 9)]))
+    program.block("price", [x[:, 0][None]], lambda e, p: (3 * ca.sum1(e), []))
     solver = program.solver({"ipopt.max_iter": 0})
 
     y, p = ca.MX.sym("y", 11), ca.MX.sym("p", 1)
     X = y * ca.DM(program.scale)
-    f, g = 0, []
+    f, g = 3 * ca.sum1(X[0:10:2]), []
     for k in range(4):
         a, b = X[2 * k : 2 * k + 2], X[2 * k + 2 : 2 * k + 4]
         f += X[10] * ca.sin(a[1]) ** 2 * p

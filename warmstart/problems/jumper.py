@@ -34,10 +34,13 @@ HELD_LIMITS = (
     *(f"{side}_Thorax_{axis}" for side in "LR" for axis in "xyz"),
     *(f"{side}_{dof}" for side in "LR" for dof in ("Ankle_z", "Toe_x", "Toe_z")),
     *("Spine_x", "Spine_y", "Spine_z", "Chest_x", "Chest_z"),
-    *("Neck_y", "Head_y"),
+    *("Neck_x", "Neck_y", "Head_y"),
 )
 """Held joints whose holding torque comes near its limit in stance and is therefore bounded."""
-FLIGHT_LIMITS = ("L_Knee_x", "R_Knee_x", "L_Thorax_y", "R_Thorax_y", "Spine_x", "Neck_y")
+FLIGHT_LIMITS = (
+    *(f"{side}_{dof}" for side in "LR" for dof in ("Knee_x", "Thorax_y", "Thorax_z")),
+    *("Spine_x", "Neck_y"),
+)
 """The same in flight."""
 POSITION = {
     "pitch": (-0.7, 1.9),
@@ -115,9 +118,11 @@ def start_rows(
     """The first knot is the touch-down of the take-off foot out of a run.
 
     Centre of mass: forward ``speed`` (m/s), vertical velocity in ``sink`` (m/s), little
-    sideways; hinges no faster than ``limb_rate`` (rad/s); trunk upright.
+    sideways; hinges no faster than ``limb_rate`` (rad/s); trunk upright. Rates are those before
+    the impact of the foot, where the program has one.
     """
     model = program.model
+    rates = program.v[0] if program.before is None else program.before
 
     def build(q, v, p):
         _, com = center_of_mass(model.tree, model.motion(q, v))
@@ -127,8 +132,8 @@ def start_rows(
             ("sink speed", com[2], *sink),
         ]
 
-    program.rows("start", [0], build, rates=True)
-    program.bound(program.v[0, 6:], -limb_rate, limb_rate)
+    program.program.block("start", [program.q[:1], rates[None]], lambda *x: (0.0, build(*x)))
+    program.bound(rates[6:], -limb_rate, limb_rate)
     limits = {
         "z": (0.80, 1.1),
         "pitch": (-0.45, 0.25),
@@ -141,7 +146,7 @@ def start_rows(
     for name, (low, high) in limits.items():
         program.bound(program.q[0, model.index(name)], low, high)
     for name in ("pitch", "roll", "yaw"):
-        program.bound(program.v[0, model.index(name)], -2.5, 2.5)
+        program.bound(rates[model.index(name)], -2.5, 2.5)
 
 
 def legs(left: Sequence[float], right: Sequence[float], **more: float) -> dict[str, float]:
