@@ -40,10 +40,6 @@ class Motion:
         """For bodies and worlds of ``shape`` (..., N)."""
         return cls(*(np.zeros((k, *shape), np.float32) for k in (3, 4, 3, 3)))
 
-    def of(self, worlds: slice) -> Motion:
-        """Views of some worlds."""
-        return Motion(*(getattr(self, f.name)[..., worlds] for f in fields(self)))
-
 
 @dataclass(frozen=True)
 class Results:
@@ -82,20 +78,6 @@ class Results:
             objects=Motion.zeros(len(scene.free_objects), n),
             ground_force=np.zeros((3, agents * links, n), np.float32),
             pair_force=np.zeros((len(scene.contact_pairs), n), np.float32),
-        )
-
-    def of(self, worlds: slice) -> Results:
-        """Views of some worlds."""
-        return Results(
-            self.qpos[worlds],
-            self.qvel[worlds],
-            self.mocap_pos[worlds],
-            self.links.of(worlds),
-            self.rotation[..., worlds],
-            self.objects.of(worlds),
-            self.felt[..., worlds],
-            self.ground_force[..., worlds],
-            self.pair_force[..., worlds],
         )
 
     def take(self, worlds: np.ndarray, other: Results) -> None:

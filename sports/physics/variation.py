@@ -9,7 +9,7 @@ contact softness and damping, and time step; the ranges reach from MuJoCo's grou
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -57,10 +57,6 @@ class Draw:
     contact_damping: np.ndarray
     coarse: np.ndarray
     """bool"""
-
-    def of(self, worlds: slice) -> Draw:
-        """That of some worlds."""
-        return Draw(*(getattr(self, field.name)[worlds] for field in fields(self)))
 
 
 def draw(variation: Variation, num_worlds: int, substeps: int, seed: int) -> Draw:

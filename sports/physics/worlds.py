@@ -1,6 +1,6 @@
-"""Worlds of C MuJoCo on native threads: what one thread of the ``mujoco`` engine drives.
+"""The worlds of the ``mujoco`` engine in numpy: a batch of C MuJoCo and what is done around it.
 
-A control step is ``substeps`` calls of a batch, the momentum kept after each.
+A control step is ``substeps`` calls of the batch, the momentum kept after each.
 """
 
 from __future__ import annotations
