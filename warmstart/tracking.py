@@ -26,11 +26,13 @@ from sports.physics.momentum import MomentumKeeper, Tree, spatial_momentum
 from sports.registry import task_names
 from sports.scene import Scene
 from warmstart.clip import Clip, clip_from_solution
-from warmstart.outcome import flight_events
+from warmstart.outcome import OUTCOMES, flight_events
 from warmstart.replay import play, scene_of, scene_options
 from warmstart.solution import Solution
 from warmstart.tracking_cost import JumpRules, Reference, Weights, jump_rules
 
+ENOUGH = 0.98
+"""Share of the asked outcome at which no further attempt is made."""
 _VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 _State = tuple[np.ndarray, np.ndarray, np.ndarray]  # qpos, qvel, the solver's warm start
 
@@ -232,8 +234,9 @@ def track_best(
     threads: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Tracked:
-    """Tracks in the task's scene until the task calls it a success: the first that succeeds, else
-    the best of all ``attempts``.
+    """Tracks in the task's scene until the task calls it a success with the outcome that was asked
+    for, up to ``ENOUGH``; else the best of all ``attempts``: a success, then the outcome, then the
+    error of the links.
 
     Each attempt draws other noise, the later ones more of it. Raises ValueError for a reference
     whose problem is no task, RuntimeError when every attempt diverged.
@@ -254,13 +257,25 @@ def track_best(
         except RuntimeError as error:
             reason = str(error)
             continue
-        if best is None or (found.success, -found.link_error) > (best.success, -best.link_error):
+        if best is None or _rank(found) > _rank(best):
             best = found
-        if best.success:
+        if best.success and _share(best) >= ENOUGH:
             return best
     if best is None:
         raise RuntimeError(f"none of {attempts} attempts could be simulated: {reason}")
     return best
+
+
+def _share(tracked: Tracked) -> float:
+    """The outcome over the one asked for, at most 1; 1 where a task measures no such thing."""
+    meta = tracked.clip.meta
+    name = OUTCOMES[meta["problem"]].field if meta["problem"] in OUTCOMES else ""
+    asked, achieved = meta.get("asked", {}).get(name), meta.get("achieved", {}).get(name)
+    return min(achieved / asked, 1.0) if asked and achieved else 1.0
+
+
+def _rank(tracked: Tracked) -> tuple[bool, float, float]:
+    return tracked.success, _share(tracked), -tracked.link_error
 
 
 def _reference(clip: Clip, worlds: _Worlds) -> Reference:

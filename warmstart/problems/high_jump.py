@@ -81,9 +81,9 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     higher = float(np.clip(config.bar_height - 1.2, 0.0, 0.4))
     turn = 2.0 * higher  # lies down over a high bar, and moves abruptly: finer knots
     phases = [
-        Phase("flat", knots(14), (0.09, 0.30), {"L": "flat"}),
-        Phase("toe", knots(8), (0.04, 0.15), {"L": "toe"}),
-        Phase("flight", knots(36 + round(80 * higher)), (0.30, 1.20), grading=3.0),
+        Phase("flat", knots(11), (0.09, 0.30), {"L": "flat"}),
+        Phase("toe", knots(7), (0.04, 0.15), {"L": "toe"}),
+        Phase("flight", knots(28 + round(80 * higher)), (0.30, 1.20), grading=3.0),
     ]
     position = jumper.boxes(jumper.POSITION) | {
         "x": (BAR_X - 5, BAR_X + 3),
