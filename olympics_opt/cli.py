@@ -57,6 +57,26 @@ class Solve:
     """Worker processes of a sweep."""
     track: bool = True
     """Follow the motion in MuJoCo with feedback, which makes it a demonstration to learn from."""
+    second_opinion: bool = False
+    """Ask Drake's MathematicalProgram and SNOPT about the take-off too (half a minute); the answer
+    goes into certificate.json and preview.html."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Make a policy file of a run: the actor in fp16 (safetensors) and its card (JSON)."""
+
+    run: Positional[Annotated[Path, arg(metavar="RUN")]]
+    """Folder of the run; its last checkpoint is taken."""
+    out: Path
+    """The policy file, FILE.safetensors; the card is FILE.json beside it."""
+    critic: bool = False
+    """Keep the critic too, so that fine-tuning (``train --init``) need not begin without one."""
+    looks: str = ""
+    """What its motion looks like, in words, for the card."""
+    result: Path | None = None
+    """A JSON file that ``evaluate`` wrote of this run or of its export: its metrics go into the
+    card instead of those of the last training episodes."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +174,9 @@ class Study:
     """Sport with an optimisation problem and a trained policy; see ``olympics-opt list``."""
     out: Path
     """Folder for all stages and report.html."""
-    policy: str = "pretrained"
-    """Policy to fine-tune and to compare with."""
+    policy: str = "pretrained:ppo-human"
+    """Policy to fine-tune and to compare with; by default of the strength that the take-off is
+    optimised for."""
     minutes: float = 4.0
     """Training time on this machine."""
     worlds: int = 64
@@ -202,6 +223,7 @@ COMMANDS: dict[str, Command] = {
     "train": Command(
         None, "olympics_opt.play:run_train", summary="Train a policy, on the CPU or on GPUs."
     ),
+    "export": Command(Export, "olympics_opt.play:run_export"),
     "evaluate": Command(Evaluate, "olympics_opt.play:run_evaluate", "task"),
     "verify": Command(Verify, "olympics_opt.verify:run_verify", "task"),
     "render": Command(Render, "olympics_opt.play:run_render", "task"),
@@ -219,6 +241,9 @@ USER_ERRORS = (ValueError, RuntimeError, OSError, ImportError)
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command line; returns the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
+    # Threads that wait for each other sleep instead of spinning: on two cores with two other busy
+    # programs an update of PPO took 2 s instead of 12 s. Read by OpenMP when torch is imported.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     debug = "--debug" in args
     args = [a for a in args if a != "--debug"]
     name = args[0] if args else ""
@@ -337,13 +362,13 @@ def _load(place: str) -> Callable[..., int | None]:
 def _positional(config_type: type, args: Sequence[str]) -> str | None:
     """The NAME of a command line: the first word that is neither an option nor its value."""
     flags = {f.name for f in dataclasses.fields(config_type) if f.type in ("bool", bool)}
-    flags |= {f"no-{name}" for name in flags} | {"help", "h"}
+    flags |= {f"no_{name}" for name in flags} | {"help", "h"}
     skip = False
     for word in args:
         if skip:
             skip = False
         elif word.startswith("-") and len(word) > 1:
-            plain = word.lstrip("-")
+            plain = word.lstrip("-").replace("-", "_")
             skip = "=" not in word and plain not in flags and not _is_switch(plain)
         else:
             return word
@@ -352,7 +377,7 @@ def _positional(config_type: type, args: Sequence[str]) -> str | None:
 
 def _is_switch(option: str) -> bool:
     """Whether a prefixed option is a switch without a value, whatever its config."""
-    return ".no-" in option
+    return ".no_" in option
 
 
 def _option_type(word: str, name: str) -> type:

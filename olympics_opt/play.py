@@ -1,7 +1,8 @@
-"""Playing a policy: ``train``, ``evaluate`` and ``render``, with a progress display."""
+"""What one does with a policy: ``train``, ``export``, ``evaluate`` and ``render`` it."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,7 @@ from olympics_opt.progress import progress
 from warmstart import atomic
 
 if TYPE_CHECKING:
-    from olympics_opt.cli import Evaluate, Render
+    from olympics_opt.cli import Evaluate, Export, Render, Verify
     from rl.evaluate import EvaluationResult
 
 
@@ -26,6 +27,51 @@ def athlete(
     get_task(task)
     card = load_policy(policy, task).metadata
     return strength or card.get("strength", "paper"), limits or card.get("limits", "paper")
+
+
+def asked(config: Evaluate | Render | Verify) -> dict[str, Any]:
+    """What a command line says about its trials, as arguments of ``play`` and ``verify``.
+
+    Raises ValueError for an unknown task and PolicyError for a policy that cannot be used with
+    it, before anything is played or written.
+    """
+    from olympics_opt.cli import chosen_options
+
+    athlete(config.policy, config.name)
+    return {
+        "task": config.name,
+        "policy": config.policy,
+        "trials": config.trials,
+        "seed": config.seed,
+        "strength": config.strength,
+        "limits": config.limits,
+        "options": chosen_options(config, "task"),
+        "processes": config.processes,
+    }
+
+
+def training_step(policy: str, task: str) -> str:
+    """A sentence where a policy was trained at another time step than it is played at, else "".
+
+    Every trial is played at the task's own step, whatever the policy's card says: results must be
+    comparable. Raises PolicyError like ``athlete``.
+    """
+    from olympics_opt.report.sections import step_text
+    from rl.policy import load_policy
+    from sports.env import make_scene
+
+    trained = load_policy(policy, task).metadata.get("config")
+    trained = trained if isinstance(trained, dict) else {}
+    divisor = trained.get("timestep_divisor", 1)
+    if not isinstance(divisor, int) or divisor <= 1:
+        return ""
+    own, finer = make_scene(task), make_scene(task, timestep_divisor=divisor)
+    usual = step_text(own.timestep, own.substeps)
+    some = f" (some of its worlds at {usual})" if trained.get("vary") else ""
+    return (
+        f"the policy was trained at {step_text(finer.timestep, finer.substeps)}{some}; it is "
+        f"played at the task's own step, {usual}, like every policy"
+    )
 
 
 def play(
@@ -73,26 +119,20 @@ def play(
 
 def run_evaluate(config: Evaluate) -> int:
     """The command: prints the metrics and writes the result schema."""
-    from olympics_opt.cli import chosen_options
-
-    athlete(config.policy, config.name)
+    trials = asked(config)
     if config.trials >= 1:  # else the evaluation says what is wrong
         atomic.prepare(config.out)
-    played = play(
-        config.name,
-        config.policy,
-        engine=config.engine,
-        trials=config.trials,
-        seed=config.seed,
-        worlds=config.worlds,
-        strength=config.strength,
-        limits=config.limits,
-        options=chosen_options(config, "task"),
-        processes=config.processes,
-    )
+    played = play(**trials, engine=config.engine, worlds=config.worlds)
     print_metrics(played.result)
+    print_training_step(config)
     print(f"wrote {atomic.write_json(config.out, played.result)}")
     return 0
+
+
+def print_training_step(config: Evaluate | Render | Verify) -> None:
+    """Says on the terminal where a policy is played at another step than it was trained at."""
+    if note := training_step(config.policy, config.name):
+        print(f"note: {note}", flush=True)
 
 
 def print_metrics(result: dict[str, Any]) -> None:
@@ -101,13 +141,14 @@ def print_metrics(result: dict[str, Any]) -> None:
     from rich.table import Table
 
     from olympics_opt.report.page import number
+    from olympics_opt.report.sections import step_text
 
-    table = Table(
-        title=f"{result['task']}, {result['algo']}, strength {result['strength']}, "
-        f"{result['engine']}, {result['trials']} trials, seed {result['seed']}",
-        title_justify="left",
-        box=None,
+    title = (
+        f"{result['task']}, {result['algo']}, strength {result['strength']}, "
+        f"{result['engine']} at {step_text(result['timestep'], result['substeps'])}, "
+        f"{result['trials']} trials, seed {result['seed']}"
     )
+    table = Table(box=None)
     for name in ("metric", "mean", "95 % interval", "n", "unit"):
         table.add_column(name, justify="left" if name in ("metric", "unit") else "right")
     for name, m in result["metrics"].items():
@@ -116,6 +157,7 @@ def print_metrics(result: dict[str, Any]) -> None:
             name, number(m["mean"]), f"[{number(low)}, {number(high)}]", str(m["n"]), m["unit"]
         )
     console = Console()
+    console.print(title, style="italic", soft_wrap=True, highlight=False)
     console.print(table)
     for name in ("nan_worlds", "overflow"):
         if result[name]:
@@ -124,7 +166,6 @@ def print_metrics(result: dict[str, Any]) -> None:
 
 def run_render(config: Render) -> int:
     """The command. Raises ValueError without anything to write, RuntimeError without GL."""
-    from olympics_opt.cli import chosen_options
     from olympics_opt.render import render_sheet, render_video
     from rl import provenance
 
@@ -133,18 +174,8 @@ def run_render(config: Render) -> int:
     for path, suffix in ((config.out, ".mp4"), (config.sheet, ".png")):
         if path is not None and path.suffix.lower() != suffix:
             raise ValueError(f"{path} must end in {suffix}")
-    played = play(
-        config.name,
-        config.policy,
-        engine=config.engine,
-        trials=config.trials,
-        seed=config.seed,
-        strength=config.strength,
-        limits=config.limits,
-        options=chosen_options(config, "task"),
-        processes=config.processes,
-        record=True,
-    )
+    played = play(**asked(config), engine=config.engine, record=True)
+    print_training_step(config)
     written: list[Path] = []
     if config.sheet is not None:
         episodes: dict[str, Any] = {"best": played.best, "median": played.median}
@@ -167,3 +198,37 @@ def run_train(args: list[str]) -> int:
         f"{summary.minutes:.1f} minutes: {summary.checkpoint}"
     )
     return 0
+
+
+def run_export(config: Export) -> int:
+    """The command. Raises ValueError for a run or a result that cannot be used, OSError where the
+    file cannot be written."""
+    from rl.policy import export_policy
+
+    if not config.run.is_dir():
+        raise ValueError(f"there is no run '{config.run}': give the folder that `train` wrote")
+    if config.out.suffix != ".safetensors":
+        raise ValueError(f"{config.out} must end in .safetensors")
+    metrics, of = None, ""
+    if config.result is not None:
+        metrics, of = _measured(config.result)
+    atomic.prepare(config.out)
+    path = export_policy(
+        config.run,
+        config.out,
+        metrics=metrics,
+        metrics_of=of,
+        looks=config.looks,
+        critic=config.critic,
+    )
+    print(f"wrote {path} ({path.stat().st_size / 2**20:.1f} MiB) and {path.with_suffix('.json')}")
+    return 0
+
+
+def _measured(path: Path) -> tuple[dict[str, Any], str]:
+    """Metrics of a result file and the sha256 of its policy. Raises ValueError if it is none."""
+    try:
+        result = json.loads(path.read_text())
+        return dict(result["metrics"]), str(result["policy_sha256"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not a result of `evaluate` ({error!r})") from error

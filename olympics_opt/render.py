@@ -58,7 +58,7 @@ def _font(size: int) -> Any:
 
 def _number(value: float) -> str:
     if not math.isfinite(value):
-        return "–"
+        return "-"  # the font has no dash
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 

@@ -6,6 +6,7 @@ it in MuJoCo with feedback. Only what passed is written as a demonstration.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from warmstart.certificate import Certificate
     from warmstart.clip import Clip
     from warmstart.demonstration import Demonstration
+    from warmstart.drake_nlp import SecondOpinion
     from warmstart.solution import Solution
 
 SOLUTION, DEMO, CERTIFICATE, PREVIEW = (
@@ -32,17 +34,22 @@ SOLUTION, DEMO, CERTIFICATE, PREVIEW = (
 def run_solve(config: Solve) -> int:
     """The command: 0 with a demonstration, 1 when the certificate or the tracking refuses it.
 
-    Raises ValueError for an unknown problem or option, ``Infeasible`` naming the constraint that
-    stopped the optimiser.
+    Raises ValueError for an unknown problem or option, or where a second opinion cannot be had,
+    ``Infeasible`` naming the constraint that stopped the optimiser.
     """
     from olympics_opt.cli import chosen_options
 
     problem_config = config.problem  # type: ignore[attr-defined]  # added by the command line
+    if config.sweep is not None and config.second_opinion:
+        raise ValueError(
+            "a second opinion is about one motion: leave out --sweep or --second-opinion"
+        )
     if config.sweep is not None:
         return _run_sweep(config, chosen_options(config, "problem"))
     (config.out / DEMO).unlink(missing_ok=True)  # of an earlier solve with other options
     solution = optimise(config.name, problem_config, config.out)
     certificate = certify_solution(solution, config.out)
+    opinion = ask_drake(solution, certificate, config.out) if config.second_opinion else None
     found = None
     if certificate.passed and config.track:
         found = make_demonstration(solution, certificate, config.out)
@@ -50,8 +57,10 @@ def run_solve(config: Solve) -> int:
         from warmstart.clip import clip_from_solution
 
         clip_from_solution(solution).save(config.out / DEMO)
-    write_preview(solution, certificate, found, config.out / PREVIEW)
+    write_preview(solution, certificate, found, config.out / PREVIEW, opinion)
     _print_outcome(solution, certificate, found, config.out)
+    if opinion is not None:
+        print(f"second opinion: {opinion.sentence()}")
     return 0 if (config.out / DEMO).is_file() else 1
 
 
@@ -83,6 +92,24 @@ def certify_solution(solution: Solution, out: Path) -> Certificate:
     return certificate
 
 
+def ask_drake(solution: Solution, certificate: Certificate, out: Path) -> SecondOpinion:
+    """Drake's and SNOPT's second opinion on a take-off; joins it to certificate.json.
+
+    It is an opinion on how good the motion is, not a check: a motion that is dearer than it need
+    be is still possible. Raises ValueError for a motion without a stance before a flight.
+    """
+    from warmstart import atomic
+    from warmstart.drake_nlp import second_opinion
+
+    with progress("second opinion, Drake and SNOPT") as bar:
+        opinion = second_opinion(solution)
+        bar.finish("agrees" if opinion.agrees else "does not agree")
+    found = {"agrees": opinion.agrees, "improvement": opinion.improvement}
+    found |= dataclasses.asdict(opinion)
+    atomic.write_json(out / CERTIFICATE, certificate.to_dict() | {"second_opinion": found})
+    return opinion
+
+
 def make_demonstration(
     solution: Solution, certificate: Certificate, out: Path, seed: int = 0
 ) -> Demonstration:
@@ -107,7 +134,11 @@ def make_demonstration(
 
 
 def write_preview(
-    solution: Solution, certificate: Certificate, found: Demonstration | None, path: Path
+    solution: Solution,
+    certificate: Certificate,
+    found: Demonstration | None,
+    path: Path,
+    opinion: SecondOpinion | None = None,
 ) -> Path:
     """The page of one optimised motion: asked, achieved, checks, plots, replay, provenance."""
     from olympics_opt.report import sections
@@ -127,6 +158,7 @@ def write_preview(
             motion_replay(solution, tracked),
             Section("The motion over time", [solution_plots(solution)]),
             sections.certificate_section(facts),
+            *([opinion_section(opinion)] if opinion is not None else []),
             sections.provenance_section(
                 {
                     "problem": solution.problem,
@@ -143,6 +175,27 @@ def write_preview(
         "full inverse dynamics.",
     )
     return write_page(page, path)
+
+
+def opinion_section(opinion: SecondOpinion) -> Section:
+    """What another formulation and another solver say about the take-off."""
+    from olympics_opt.report.page import Section, Table, Text
+
+    rows: list[list[object]] = [
+        ["violation of the constraints (scaled)", opinion.reference_violation, opinion.violation],
+        ["cost", opinion.reference_cost, opinion.cost],
+        ["effort (s)", opinion.effort_reference, opinion.effort],
+    ]
+    return Section(
+        "Second opinion",
+        [
+            Text(opinion.sentence(), "verdict", "good" if opinion.agrees else "warn"),
+            Table(["", "the optimised motion", "after SNOPT"], rows, "Both in Drake's program."),
+        ],
+        "The last stance before the flight, between the same states and in the same time, written "
+        "again for Drake's MathematicalProgram on a reduced Drake plant and given to SNOPT. The "
+        "stance of an optimal motion must be feasible and stationary there too.",
+    )
 
 
 def tracking_tiles(tracked: Clip) -> Tiles:

@@ -7,11 +7,13 @@ checkpoint). Sized to end within a quarter of an hour on two processor cores.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from olympics_opt.fine_tune import POLICY, FineTuning, fine_tune
 from olympics_opt.solve import CERTIFICATE, DEMO, SOLUTION
 from olympics_opt.stages import Done, Stage, run_stages
 from warmstart import atomic
@@ -40,18 +42,7 @@ PLANS: dict[str, Plan] = {
     "long_jump": Plan("long_jump", 5.0),
 }
 
-START_PROBABILITY = (0.5, 0.1)
-"""Share of training episodes that start from a state of the tracked motion: first, last."""
-FINE_TUNING: dict[str, Any] = {
-    "minibatches": 2,
-    "epochs": 2,
-    "sigma": 0.06,
-    "learning_rate": 2e-5,
-    "learning_rate_limits": (1e-6, 1e-4),
-    "critic_warmup": 10,
-}
-"""PPO for a few minutes from a policy that is good already: small steps, little noise, and a
-critic that first learns to judge it."""
+TUNING = FineTuning()
 
 
 def run_study(config: Study) -> int:
@@ -66,7 +57,7 @@ def run_study(config: Study) -> int:
     policy = load_policy(config.policy, config.name)
     if policy.actor is None:
         raise ValueError(f"'{config.policy}' is a baseline: a study fine-tunes a trained policy")
-    stages = make_stages(config, plan, policy.metadata["sha256"])
+    stages = make_stages(config, plan, policy.metadata)
     try:
         done = run_stages(config.out, stages)
     except KeyboardInterrupt:
@@ -80,10 +71,11 @@ def run_study(config: Study) -> int:
     return 0
 
 
-def make_stages(config: Study, plan: Plan, policy_sha256: str) -> list[Stage]:
-    """The stages of a study, wired to its folders."""
+def make_stages(config: Study, plan: Plan, card: dict[str, Any]) -> list[Stage]:
+    """The stages of a study, wired to its folders; ``card`` is that of the shipped policy."""
     out, task = config.out, config.name
-    run = out / "train" / "run"
+    policy_sha256 = card["sha256"]
+    tuned = str(out / "train" / POLICY)
 
     def solve(folder: Path) -> dict[str, Any]:
         from olympics_opt.solve import optimise
@@ -132,42 +124,35 @@ def make_stages(config: Study, plan: Plan, policy_sha256: str) -> list[Stage]:
         }
 
     def train(folder: Path) -> dict[str, Any]:
-        from rl.ppo import PPOConfig
-        from rl.train import TrainConfig, train
+        from rl.train import TrainConfig
         from warmstart.bank import demonstration_files
 
         demo = out / "warm_start" / DEMO
         clips = (demo,) if demo.is_file() else tuple(demonstration_files(plan.problem))
-        summary = train(
+        trained = card.get("config")
+        facts = fine_tune(
             TrainConfig(
                 task=task,
-                out=run,
+                out=folder / "run",
                 engine="mujoco",
                 worlds=config.worlds,
                 minutes=config.minutes,
                 seed=config.seed,
-                resume=True,
                 checkpoint_minutes=0.5,
                 options=plan.options,
+                vary=bool(trained.get("vary")) if isinstance(trained, dict) else False,
                 init=config.policy,
                 clips=clips,
-                start_probability=START_PROBABILITY,
-                ppo=PPOConfig(**FINE_TUNING),
-            )
+            ),
+            folder,
+            TUNING,
         )
-        if summary.stopped_by == "signal":
-            raise KeyboardInterrupt
-        return {
-            "samples": summary.samples,
-            "minutes": summary.minutes,
-            "iterations": summary.iterations,
-            "clips": ["the tracked motion" if c == demo else c.stem for c in clips],
-        }
+        return facts | {"clips": ["the tracked motion" if c == demo else c.stem for c in clips]}
 
     def evaluate(folder: Path) -> dict[str, Any]:
-        from olympics_opt.play import play
+        from olympics_opt.play import play, training_step
 
-        for name, source in (("shipped", config.policy), ("fine-tuned", str(run))):
+        for name, source in (("shipped", config.policy), ("fine-tuned", tuned)):
             played = play(
                 task,
                 source,
@@ -180,14 +165,14 @@ def make_stages(config: Study, plan: Plan, policy_sha256: str) -> list[Stage]:
             atomic.write_json(folder / f"{name}.json", played.result)
             played.best.save(folder / f"{name}_best.npz")
             played.median.save(folder / f"{name}_median.npz")
-        return {}
+        return {"training_step": training_step(config.policy, task)}
 
     def verify(folder: Path) -> dict[str, Any]:
         from olympics_opt.verify import verdict_text, verify
 
         report, recordings = verify(
             task,
-            str(run),
+            tuned,
             trials=config.drake_trials,
             seed=config.seed,
             options=plan.options,
@@ -208,7 +193,7 @@ def make_stages(config: Study, plan: Plan, policy_sha256: str) -> list[Stage]:
 
     seed = {"seed": config.seed}
     return [
-        Stage("solve", "Optimising a take-off", solve, {"plan": _plain(plan)}),
+        Stage("solve", "Optimising a take-off", solve, {"plan": dataclasses.asdict(plan)}),
         Stage("certify", "Certifying it in Drake and MuJoCo", certify, needs=("solve",)),
         Stage("warm_start", "Tracking it in MuJoCo", warm_start, seed, needs=("solve", "certify")),
         Stage(
@@ -221,8 +206,7 @@ def make_stages(config: Study, plan: Plan, policy_sha256: str) -> list[Stage]:
                 "worlds": config.worlds,
                 "policy_sha256": policy_sha256,
                 "options": plan.options,
-                "fine_tuning": FINE_TUNING,
-                "start_probability": START_PROBABILITY,
+                "fine_tuning": dataclasses.asdict(TUNING),
             },
             needs=("warm_start",),
             continues=True,
@@ -261,9 +245,3 @@ def headline(done: dict[str, Done]) -> str:
         lines.append(f"{name}: success {success['mean']:.0%} of {result['trials']} trials")
     lines.append(f"in Drake: {done['verify'].facts['verdict']}")
     return "\n".join(lines)
-
-
-def _plain(plan: Plan) -> dict[str, Any]:
-    import dataclasses
-
-    return dataclasses.asdict(plan)

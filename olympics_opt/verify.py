@@ -173,25 +173,15 @@ def parity_rows(task: str, strength: str, limits: str) -> list[dict[str, Any]]:
 
 def run_verify(config: Verify) -> int:
     """The command: 0 when the result holds, 1 when it does not."""
-    from olympics_opt.cli import chosen_options
-    from olympics_opt.play import athlete
+    from olympics_opt.play import asked, print_training_step
     from olympics_opt.report.page import Page, write_page
     from olympics_opt.report.verification import verification_sections
 
     if config.trials < 1:
         raise ValueError(f"trials must be at least 1, not {config.trials}")
-    athlete(config.policy, config.name)
+    trials = asked(config)
     atomic.prepare(config.out / "report.json")
-    report, recordings = verify(
-        config.name,
-        config.policy,
-        trials=config.trials,
-        seed=config.seed,
-        strength=config.strength,
-        limits=config.limits,
-        options=chosen_options(config, "task"),
-        processes=config.processes,
-    )
+    report, recordings = verify(**trials)
     atomic.write_json(config.out / "report.json", report)
     page = Page(
         f"{config.name.replace('_', ' ').capitalize()}: does the result hold in Drake?",
@@ -200,6 +190,7 @@ def run_verify(config: Verify) -> int:
     )
     path = write_page(page, config.out / "report.html")
     print(verdict_text(report))
+    print_training_step(config)
     print(f"wrote {path} and {config.out / 'report.json'}")
     return 0 if report["verdict"]["passed"] else 1
 

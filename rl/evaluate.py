@@ -21,18 +21,17 @@ import torch
 from scipy import stats
 
 from rl import provenance
+from rl.host import one_torch_thread
 from rl.policy import Policy, load_policy
-from rl.recording import Recording
-from sports.env import START_NOISE, Env, Starts, make_env, make_scene
+from rl.recording import Recording, Tape
+from sports.env import Env, Starts, make_env, make_scene
 from sports.registry import get_task
+from sports.starts import START_NOISE
 
 __all__ = ["EvaluationResult", "Recording", "evaluate", "interval"]
 
 DEFAULT_WORLDS = {"mujoco": 250, "warp": 1000, "drake": 2}
 START_FRAMES = 4096
-RECORDING_BYTES = 2 * 2**30
-"""Episodes are kept for recordings up to this much memory; later ones are only counted."""
-
 KEEP_ALL = 64
 """A share of more trials keeps its best and its median only."""
 
@@ -92,6 +91,9 @@ class _Played:
     """By trial; all that may turn out best or median."""
     overflow: int
     nan_worlds: int
+    timestep: float
+    """Of the engine (s): Drake may take more of them than the scene asks for."""
+    substeps: int
 
 
 def evaluate(
@@ -146,7 +148,7 @@ def evaluate(
     strength = strength or str(card.get("strength", "paper"))
     limits = limits or str(card.get("limits", "paper"))
     options = dict(options or {})
-    scene = make_scene(
+    make_scene(  # a mistake is told before any process starts
         task,
         strength=strength,  # type: ignore[arg-type]
         limits=limits,  # type: ignore[arg-type]
@@ -187,8 +189,8 @@ def evaluate(
         "strength": strength,
         "limits": limits,
         "options": options,
-        "timestep": scene.timestep,
-        "substeps": scene.substeps,
+        "timestep": played[0].timestep,
+        "substeps": played[0].substeps,
         "start_noise": start_noise,
         "trials": trials,
         "seed": seed,
@@ -288,7 +290,8 @@ def _play(policy: Policy, job: _Job, report: Callable[[int], None] | None = None
         policy.seed(job.seed)
         if job.start_noise > 0.0:
             env.starts = standing_starts(env, job.start_noise, job.seed)
-        return _play_episodes(policy, job, env, episodes, report)
+        with one_torch_thread(env.device):
+            return _play_episodes(policy, job, env, episodes, report)
     finally:
         env.close()
 
@@ -320,7 +323,7 @@ def _play_episodes(
         n: np.full((episodes, env.num_worlds), np.nan) for n in (*names, "return", "episode_steps")
     }
     spans: dict[tuple[int, int], tuple[int, int]] = {}
-    tape = _Tape(env, job.record or bool(job.worlds_recorded))
+    tape = Tape(env, job.record or bool(job.worlds_recorded))
     obs, step = env.reset(), 0
     while (trial_of < episodes).any():
         action = policy(obs)
@@ -355,12 +358,21 @@ def _play_episodes(
     if job.record and taped:
         order = _ranked(job.task, trials, taped)
         keep |= set(order if len(order) <= KEEP_ALL else (order[-1], order[len(order) // 2]))
+    common = ("task", "options", "seed", "engine", "strength", "limits", "timestep_divisor")
+    facts = {name: getattr(job, name) for name in common}
     recordings = {
-        trial: tape.cut(job, *taped[trial], {n: float(trials[n][trial]) for n in names})
+        trial: tape.cut(*taped[trial], {n: float(trials[n][trial]) for n in names}, facts)
         for trial in sorted(keep)
     }
     physics = env.physics
-    return _Played(trials, recordings, int(physics.overflow), int(physics.nan_worlds))
+    return _Played(
+        trials,
+        recordings,
+        int(physics.overflow),
+        int(physics.nan_worlds),
+        timestep=getattr(physics, "timestep", physics.scene.timestep),
+        substeps=getattr(physics, "substeps", physics.scene.substeps),
+    )
 
 
 def _settled(value: float, bad: bool, unit: str) -> float:
@@ -368,52 +380,6 @@ def _settled(value: float, bad: bool, unit: str) -> float:
     if not bad or math.isnan(value):
         return float(value)
     return 0.0 if unit == "fraction" else math.nan
-
-
-class _Tape:
-    """Every step of every world, on the host, up to RECORDING_BYTES."""
-
-    def __init__(self, env: Env, on: bool) -> None:
-        self.env, self.on = env, on
-        self.steps: list[dict[str, np.ndarray]] = []
-        self._bytes = 0
-        env.keep_snapshot = on
-
-    def add(self, action: torch.Tensor, result: Any) -> None:
-        """Keeps the step just taken."""
-        if not self.on or self._bytes > RECORDING_BYTES:
-            return
-        tensors: Mapping[str, torch.Tensor] = {
-            **self.env.final_snapshot,
-            "action": action,
-            "reward": result.reward,
-            **{f"terms/{n}": x for n, x in result.terms.items()},
-        }
-        # Copies: an engine may overwrite its tensors in the next step.
-        row = {n: np.array(x.cpu().numpy(), dtype=np.float32) for n, x in tensors.items()}
-        self._bytes += sum(x.nbytes for x in row.values())
-        self.steps.append(row)
-
-    def cut(
-        self, job: _Job, world: int, start: int, end: int, metrics: dict[str, float]
-    ) -> Recording:
-        """The steps [start, end) of one world."""
-        rows = {n: np.stack([s[n][world] for s in self.steps[start:end]]) for n in self.steps[0]}
-        terms = {n[6:]: rows.pop(n) for n in list(rows) if n.startswith("terms/")}
-        return Recording(
-            task=job.task,
-            options=job.options,
-            terms=terms,
-            metrics=metrics,
-            seed=job.seed,
-            world=int(world),
-            dt=self.env.physics.scene.control_timestep,
-            engine=job.engine,
-            strength=job.strength,
-            limits=job.limits,
-            timestep_divisor=job.timestep_divisor,
-            **rows,  # type: ignore[arg-type]
-        )
 
 
 def _ranked(task: str, values: Mapping[str, np.ndarray], of: Iterable[int]) -> list[int]:

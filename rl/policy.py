@@ -237,6 +237,7 @@ def export_policy(
     out: Path | str,
     *,
     metrics: dict[str, Any] | None = None,
+    metrics_of: str = "",
     looks: str = "",
     critic: bool = False,
 ) -> Path:
@@ -246,10 +247,13 @@ def export_policy(
         run: the run's folder; its last checkpoint is taken.
         out: target; any suffix becomes ``.safetensors``.
         metrics: an evaluation's metrics for the card; the run's last ones if None.
+        metrics_of: sha256 of the policy that was evaluated, where it is known: it must be the
+            run's (its last checkpoint) or that of this export.
         looks: what the motion looks like, in words.
         critic: keep the critic too, so that fine-tuning need not begin without one.
 
-    Raises PolicyError when the run has no readable checkpoint.
+    Raises PolicyError when the run has no readable checkpoint, when its weights do not fit fp16,
+    and for metrics of another policy.
     """
     policy = _from_run(Path(run))
     assert policy.actor is not None
@@ -263,7 +267,13 @@ def export_policy(
     if not all(torch.isfinite(v).all() for v in weights.values()):
         raise PolicyError(f"the weights of run '{run}' do not fit fp16")
     data = save(weights)
-    card = dict(policy.metadata) | {"sha256": hashlib.sha256(data).hexdigest()}
+    digest = hashlib.sha256(data).hexdigest()
+    if metrics_of and metrics_of not in (policy.metadata["sha256"], digest):
+        raise PolicyError(
+            f"the metrics are of another policy ({metrics_of[:12]}...) than the last checkpoint "
+            f"of '{run}': evaluate that one"
+        )
+    card: dict[str, Any] = {**policy.metadata, "sha256": digest}
     card["config"] = _portable(card.get("config", {}))
     if metrics is not None:
         card["metrics"] = metrics

@@ -1,18 +1,23 @@
-"""A recorded episode: every state, action, reward term and force of one world, as an npz."""
+"""A recorded episode: every state, action, reward term and force of one world, as an npz.
+
+It is cut from a ``Tape``, which runs along with all worlds of an environment.
+"""
 
 from __future__ import annotations
 
 import io
 import json
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from sports.env import make_scene
+from sports.env import Env, make_scene
 from sports.scene import Scene
 from warmstart.atomic import write_bytes
 
@@ -98,3 +103,48 @@ class Recording:
 
 
 _ARRAYS = ("qpos", "qvel", "mocap_pos", "action", "reward", "ground_force")
+
+
+RECORDING_BYTES = 2 * 2**30
+"""Episodes are kept for recordings up to this much memory; later ones are only counted."""
+
+
+class Tape:
+    """Every step of every world, on the host, up to RECORDING_BYTES."""
+
+    def __init__(self, env: Env, on: bool) -> None:
+        self.env, self.on = env, on
+        self.steps: list[dict[str, np.ndarray]] = []
+        self._bytes = 0
+        env.keep_snapshot = on
+
+    def add(self, action: torch.Tensor, result: Any) -> None:
+        """Keeps the step just taken."""
+        if not self.on or self._bytes > RECORDING_BYTES:
+            return
+        tensors: Mapping[str, torch.Tensor] = {
+            **self.env.final_snapshot,
+            "action": action,
+            "reward": result.reward,
+            **{f"terms/{n}": x for n, x in result.terms.items()},
+        }
+        # Copies: an engine may overwrite its tensors in the next step.
+        row = {n: np.array(x.cpu().numpy(), dtype=np.float32) for n, x in tensors.items()}
+        self._bytes += sum(x.nbytes for x in row.values())
+        self.steps.append(row)
+
+    def cut(
+        self, world: int, start: int, end: int, metrics: dict[str, float], facts: Mapping[str, Any]
+    ) -> Recording:
+        """The steps [start, end) of one world; ``facts`` are the other fields of a Recording."""
+        rows: dict[str, Any]
+        rows = {n: np.stack([s[n][world] for s in self.steps[start:end]]) for n in self.steps[0]}
+        terms = {n[6:]: rows.pop(n) for n in list(rows) if n.startswith("terms/")}
+        return Recording(
+            terms=terms,
+            metrics=metrics,
+            world=int(world),
+            dt=self.env.physics.scene.control_timestep,
+            **facts,
+            **rows,
+        )

@@ -8,39 +8,18 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from sports.frames import Heading, proprioception, proprioception_slices
+from sports.frames import proprioception, proprioception_slices
 from sports.humanoid.body import Limits, Strength, load_body
-from sports.physics import Geometry, Physics, PhysicsState, default_state, make_physics
+from sports.physics import Physics, PhysicsState, default_state, make_physics
 from sports.registry import get_task, make_config
 from sports.scene import Scene
-from sports.task import Memory, Task, View
-
-START_NOISE = 0.02
-"""Joint noise of a training start (rad), uniform."""
-
-
-@dataclass
-class Starts:
-    """Frames of demonstrations from which episodes may start (reference-state initialisation)."""
-
-    qpos: Tensor
-    """(F, 7 + num_dofs) of one athlete, task world."""
-    qvel: Tensor
-    """(F, 6 + num_dofs)"""
-    context: dict[str, Tensor]
-    """(F,) labels of the frame's demonstration that the task understands (``bar_height``)."""
-    probability: float = 0.5
-    """Share of resets that start from a frame."""
-
-    def to(self, device: torch.device | str) -> Starts:
-        """The same frames on a device."""
-        context = {k: v.to(device) for k, v in self.context.items()}
-        return Starts(self.qpos.to(device), self.qvel.to(device), context, self.probability)
+from sports.starts import Starts, Stock, add_noise
+from sports.task import Memory, Task, View, falling_heights
 
 
 @dataclass
@@ -102,16 +81,17 @@ class Env:
         self.memory: Memory = {}
         self.view = View(
             physics=physics,
-            geometry=Geometry(body, self.device),
+            geometry=physics.geometry,
             config=config,
             curriculum=task.curriculum(config, n, self.device) if task.curriculum else {},
             clock=torch.zeros(n, dtype=torch.long, device=self.device),
-            heading=Heading(physics.body_quat[:, :, 0]),
             control_timestep=scene.control_timestep,
             foot_links=torch.tensor(foot, device=self.device),
-            head_index=body.link_index("Head"),
+            lowest=torch.tensor(falling_heights(body.link_names, foot), device=self.device),
         )
         self._default = default_state(scene, n, self.device)
+        self._stocks = hasattr(physics, "prepare")
+        self._stock: Stock | None = None
         self.final_snapshot: dict[str, Tensor] = {}
         """State before the automatic reset of the last step, filled if ``keep_snapshot``."""
         self.keep_snapshot = False
@@ -128,6 +108,7 @@ class Env:
         """Resets every world; (N, A, obs)."""
         everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
         self._reset(everyone)
+        self._stock = None
         if self.training and self.task.age_at_start:
             # Once, so that worlds do not all reach the time limit together.
             draw = torch.rand(self.num_worlds, device=self.device, generator=self.generator)
@@ -170,9 +151,11 @@ class Env:
             ended_well = (terminated | truncated) & ~bad
             self.view.curriculum = self.task.promote(self.view, self.memory, step, ended_well)
 
-        obs = final_obs
-        # On a CPU asking costs nothing and saves the work; on a GPU it would wait.
-        if self.device.type != "cpu" or bool(ended.any()):
+        if self._stocks:
+            # On a CPU, asking which worlds ended costs nothing and saves the work.
+            worlds = ended.nonzero()[:, 0]
+            obs = self._restart(worlds, final_obs) if worlds.numel() else final_obs
+        else:
             self._reset(ended)
             obs = self._observe()
         return StepResult(
@@ -188,13 +171,10 @@ class Env:
         )
 
     def _reset(self, mask: Tensor) -> None:
-        state = self._default.clone()
-        context = self._draw_start(state)
-        state, context = self.task.start(self.view, state, context, self.generator, self.training)
+        state, context = self._draw()
         self.physics.reset(mask, state)
-        zero = torch.zeros((), dtype=torch.long, device=self.device)
-        self.view.clock = torch.where(mask, zero, self.view.clock)
-        self.age = torch.where(mask, zero, self.age)
+        self.view.clock = self.view.clock.masked_fill(mask, 0)
+        self.age = self.age.masked_fill(mask, 0)
         self.view.refresh()
         fresh = self.task.begin(self.view, context)
         if not self.memory:
@@ -204,28 +184,48 @@ class Env:
             for k, v in fresh.items()
         }
 
-    def _draw_start(self, state: PhysicsState) -> Memory:
-        """Joint noise, or a frame of a demonstration; labels are NaN for a standing start."""
-        scene, n = self.physics.scene, self.num_worlds
-        if self.training:
-            for agent in range(self.num_agents):
-                joints = state.qpos[:, scene.agent_qpos(agent)][:, 7:]
-                draw = torch.rand(joints.shape, device=self.device, generator=self.generator)
-                joints += START_NOISE * (2.0 * draw - 1.0)
-        if self.starts is None:
-            return {}
-        frames = self.starts.qpos.shape[0]
-        draw = torch.rand(n, 2, device=self.device, generator=self.generator)
-        use = draw[:, 0] < self.starts.probability
-        frame = (draw[:, 1] * frames).long().clamp(max=frames - 1)
-        q, v = scene.agent_qpos(0), scene.agent_qvel(0)
-        state.qpos[:, q] = torch.where(use[:, None], self.starts.qpos[frame], state.qpos[:, q])
-        state.qvel[:, v] = torch.where(use[:, None], self.starts.qvel[frame], state.qvel[:, v])
-        nan = torch.full((), torch.nan, device=self.device)
-        return {k: torch.where(use, c[frame], nan) for k, c in self.starts.context.items()}
+    def _restart(self, worlds: Tensor, obs: Tensor) -> Tensor:
+        """Resets worlds, by index, from the stock; ``obs`` with their new rows."""
+        stock = self._stock
+        if stock is None or not stock.serves(worlds, self.curriculum):
+            stock = self._stock = self._prepare(*self._draw())
+        stock.used[worlds] = True
+        cast(Any, self.physics).restart(worlds, stock.shown)
+        self.view.clock = self.view.clock.index_fill(0, worlds, 0)
+        self.age = self.age.index_fill(0, worlds, 0)
+        self.view.refresh()
+        self.memory = {
+            k: v.index_copy(0, worlds, stock.memory[k][worlds]) for k, v in self.memory.items()
+        }
+        return obs.index_copy(0, worlds, stock.obs[worlds])
 
-    def _observe(self) -> Tensor:
-        goal = self.task.features(self.view, self.memory)
+    def _prepare(self, state: PhysicsState, context: Memory) -> Stock:
+        shown = cast(Any, self.physics).prepare(state)
+        view = dataclasses.replace(self.view, physics=shown)
+        view.refresh()
+        fresh = self.task.begin(view, context)
+        return Stock(
+            state=state,
+            context=context,
+            shown=shown,
+            memory={k: v.to(self.memory[k].dtype) for k, v in fresh.items()},
+            obs=self._observe(view, fresh),
+            curriculum=dict(self.curriculum),
+            used=torch.zeros(self.num_worlds, dtype=torch.bool),
+        )
+
+    def _draw(self) -> tuple[PhysicsState, Memory]:
+        """The start of an episode in every world, and the context of ``Task.begin``."""
+        state, scene = self._default.clone(), self.physics.scene
+        if self.training:
+            add_noise(state, scene, self.generator)
+        context = self.starts.draw(state, scene, self.generator) if self.starts else {}
+        return self.task.start(self.view, state, context, self.generator, self.training)
+
+    def _observe(self, view: View | None = None, memory: Memory | None = None) -> Tensor:
+        """(n, A, obs) of a view's worlds; by default of all."""
+        view, memory = view or self.view, memory or self.memory
+        goal = self.task.features(view, memory)
         if not self.obs_slices:
             slices = proprioception_slices(self.physics.scene.body.num_links)
             at = slices["body_angvel"].stop
@@ -233,11 +233,7 @@ class Env:
                 slices[f"goal/{name}"] = slice(at, at + value.shape[-1])
                 at += value.shape[-1]
             self.obs_slices = slices
-        obs = torch.cat(
-            (proprioception(self.physics, self.view.heading, self.view.rotation), *goal.values()),
-            dim=-1,
-        )
-        return torch.nan_to_num(obs)
+        return proprioception(view.physics, view.heading, tuple(goal.values())).nan_to_num_()
 
     def snapshot(self) -> dict[str, Tensor]:
         """Copies of qpos, qvel, mocap_pos and ground_force, for recordings."""
@@ -262,6 +258,8 @@ class Env:
         extra = getattr(self.physics, "extra_state", None)
         if extra is not None:
             state |= {f"physics/{k}": v for k, v in extra().items()}
+        if self._stock is not None:
+            state |= {f"stock/{k}": v for k, v in self._stock.state_dict().items()}
         state |= {f"memory/{k}": v.clone() for k, v in self.memory.items()}
         state |= {f"curriculum/{k}": v.clone() for k, v in self.curriculum.items()}
         return state
@@ -281,12 +279,27 @@ class Env:
         if load_extra is not None:
             prefix = "physics/"
             load_extra({k[len(prefix) :]: v for k, v in moved.items() if k.startswith(prefix)})
-        self.view.clock, self.age = moved["clock"], moved["age"]
+        self.view.clock, self.age = moved["clock"].clone(), moved["age"].clone()
+        self.memory = {k[7:]: v.clone() for k, v in moved.items() if k.startswith("memory/")}
+        self._load_stock({k[6:]: v for k, v in moved.items() if k.startswith("stock/")})
         self.generator.set_state(moved["generator"].cpu())
-        self.memory = {k[7:]: v for k, v in moved.items() if k.startswith("memory/")}
         self.view.curriculum = {k[11:]: v for k, v in moved.items() if k.startswith("curriculum/")}
         self.view.refresh()
         return self._observe()
+
+    def _load_stock(self, state: dict[str, Tensor]) -> None:
+        """Works the stock of :meth:`state_dict` out again."""
+        self._stock = None
+        if not state or not self._stocks:
+            return
+
+        def part(prefix: str) -> Memory:
+            return {k[len(prefix) :]: v.clone() for k, v in state.items() if k.startswith(prefix)}
+
+        start = PhysicsState(*(state[k].clone() for k in ("qpos", "qvel", "mocap_pos")))
+        self.view.curriculum = part("curriculum/")
+        self._stock = self._prepare(start, part("context/"))
+        self._stock.used = state["used"].clone()
 
     def close(self) -> None:
         """Frees the engine."""

@@ -220,7 +220,8 @@ def advance(view: View, memory: Memory) -> Advance:
     wrong_side = crosses & (beside | (at[:, 2] < height))
 
     bar = view.physics.object_pos[:, 0]
-    shift = (bar - memory["bar_rest"])[:, :2].norm(dim=-1)
+    aside = bar - memory["bar_rest"]
+    shift = torch.hypot(aside[:, 0], aside[:, 1])
     displaced = (
         (memory["bar_rest"][:, 2] - bar[:, 2] > MAX_DROP)
         | (shift > MAX_SHIFT)
@@ -286,10 +287,12 @@ def _goal(root: Tensor) -> Tensor:
 def _lowest_over_bar(view: View) -> Tensor:
     """(N,) z of the lowest body point within 5 cm of the bar's plane; inf if there is none."""
     geometry = view.geometry
-    points = geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0])
-    over = (points[..., 0] - BAR_X).abs() < 0.05
-    bottom = points[..., 2] - geometry.link_radii
-    return torch.where(over, bottom, torch.inf).flatten(1).amin(-1)
+    x, z = (
+        geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0], axis)
+        for axis in (0, 2)
+    )
+    over = (x - BAR_X).abs() < 0.05
+    return torch.where(over, z - geometry.link_radii, torch.inf).amin((1, 2))
 
 
 TASK = Task(

@@ -61,10 +61,10 @@ def begin(view: View, context: Memory) -> Memory:
     """Memory after a reset: running, no mark yet."""
     root = view.root_pos[:, 0]
     zero = torch.zeros_like(root[:, 0])
-    points = view.geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0])
+    points_x = view.geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0], 0)
     return {
         "root": root.clone(),
-        "rear": _rear(view, points[..., 0]),
+        "rear": _rear(view, points_x),
         "mode": zero.long(),
         "since_landing": zero.clone(),
         "mark": torch.full_like(zero, torch.inf),
@@ -92,19 +92,22 @@ def advance(view: View, memory: Memory) -> Advance:
     goal = constant(GOAL, root.device)
     touched = view.touching()[:, 0]  # (N, B) in any substep
     geometry = view.geometry
-    rotation = view.rotation[:, 0]
-    points = geometry.link_points(view.physics.body_pos[:, 0], rotation)  # (N, B, K', 3)
-    points_x = points[..., 0]
-    on_ground = points[..., 2] - geometry.link_radii < TOUCH  # (N, B, K') now
+    points_x, points_z = (  # (N, B, K')
+        geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0], axis)
+        for axis in (0, 2)
+    )
+    clearance = points_z - geometry.link_radii
+    on_ground = clearance < TOUCH  # now
+    standing = geometry.least(clearance) < TOUCH  # (N, B)
     rear = _rear(view, points_x)
     # A link that touched within the step and is off again: all of it was at or beyond this x.
-    brief = touched & ~on_ground.any(-1)
+    brief = touched & ~standing
     brief_x = torch.where(brief, torch.minimum(rear, memory["rear"]), torch.inf)
-    any_contact = touched.any(-1) | on_ground.flatten(1).any(-1)
+    any_contact = (touched | standing).any(-1)
 
     mode = memory["mode"]
     running = mode == RUN
-    front = torch.where(on_ground, points_x, -torch.inf).flatten(1).amax(-1)
+    front = torch.where(on_ground, points_x, -torch.inf).amax((1, 2))
     brief_front = torch.where(brief, brief_x, -torch.inf).amax(-1)
     foul = running & ((front >= LINE_X) | (brief_front >= LINE_X))
     fell = running & view.fallen()[:, 0]
@@ -116,7 +119,7 @@ def advance(view: View, memory: Memory) -> Advance:
     mode = torch.where(takes_off, FLIGHT, torch.where(lands, LANDED, mode))
     landed = mode == LANDED
     nearest = torch.minimum(
-        torch.where(on_ground, points_x, torch.inf).flatten(1).amin(-1), brief_x.amin(-1)
+        torch.where(on_ground, points_x, torch.inf).amin((1, 2)), brief_x.amin(-1)
     )
     mark = torch.where(landed, torch.minimum(memory["mark"], nearest), memory["mark"])
     since_landing = memory["since_landing"] + (landed & ~lands)
@@ -133,7 +136,7 @@ def advance(view: View, memory: Memory) -> Advance:
         "length": torch.where(success, 30.0 * length, 0.0),
     }
 
-    com, com_velocity = geometry.center_of_mass(view.physics, 0, rotation)
+    com, com_velocity = geometry.center_of_mass(view.physics, 0)
     takeoff_speed = torch.where(takes_off, com_velocity.norm(dim=-1), memory["takeoff_speed"])
     takeoff_com_z = torch.where(takes_off, com[:, 2], memory["takeoff_com_z"])
     landing_com_z = torch.where(lands, com[:, 2], memory["landing_com_z"])
@@ -180,7 +183,7 @@ def length_bound(speed: Tensor, takeoff_z: Tensor, landing_z: Tensor) -> Tensor:
 
 def _rear(view: View, points_x: Tensor) -> Tensor:
     """(N, B) smallest x of each link, of its support points' x (N, B, K')."""
-    return (points_x - view.geometry.link_radii).amin(-1)
+    return view.geometry.least(points_x - view.geometry.link_radii)
 
 
 TASK = Task(

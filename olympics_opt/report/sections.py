@@ -34,8 +34,16 @@ def metric_text(metric: Mapping[str, Any] | None) -> str:
     return f"{text} {unit}"
 
 
+def step_text(timestep: float, substeps: int) -> str:
+    """``4 x 1/120 s``: how many time steps (s) an engine takes in one control step."""
+    return f"{substeps} x 1/{1.0 / timestep:.0f} s"
+
+
 def metric_table(results: Mapping[str, Mapping[str, Any]], caption: str = "") -> Table:
-    """One column per named result, one row per metric; mean and 95 % interval."""
+    """One column per named result, one row per metric; mean and 95 % interval.
+
+    The last rows are the trials and, where the results say it, the engine's time step.
+    """
     defined = [
         n for r in results.values() for n, m in r["metrics"].items() if m["mean"] is not None
     ]
@@ -45,6 +53,9 @@ def metric_table(results: Mapping[str, Mapping[str, Any]], caption: str = "") ->
         for name in names
     ]
     rows.append(["trials", *(str(r.get("trials", "–")) for r in results.values())])
+    if all("timestep" in r for r in results.values()):
+        steps = (step_text(r["timestep"], r["substeps"]) for r in results.values())
+        rows.append(["time steps of a control step", *steps])
     return Table(["", *results], rows, caption or "Mean and 95 % interval.")
 
 

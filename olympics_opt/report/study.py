@@ -23,6 +23,7 @@ def study_page(task: str, root: Path) -> Page:
     warm = _json(root / "warm_start" / "stage.json")["facts"]
     training = _json(root / "train" / "stage.json")["facts"]
     results = {n: _json(root / "evaluate" / f"{n}.json") for n in ("shipped", "fine-tuned")}
+    step_note = _json(root / "evaluate" / "stage.json")["facts"].get("training_step")
     verification = _json(root / "verify" / "report.json")
     recordings = {
         run: Recording.load(root / "verify" / f"{run}.npz")
@@ -40,7 +41,8 @@ def study_page(task: str, root: Path) -> Page:
         Section(
             "Shipped and fine-tuned",
             [sections.metric_table(results)],
-            "Both policies from the standard start, in MuJoCo, without noise in their actions.",
+            "Both policies from the standard start, in MuJoCo, without noise in their actions."
+            + (f" Of the shipped one: {step_note}." if step_note else ""),
         ),
         replay_of({"best": best, "median": median}, "replay-policy", "The policy's motion"),
         Section("The best trial over time", [sections.motion_plots(best), *_video(root, best)]),
@@ -147,10 +149,27 @@ def _learning(task: str, training: dict[str, Any], rows: list[dict[str, Any]]) -
         f"{training['iterations']} iterations. "
         + (f"Some episodes start from states of: {clips}. " if clips else "No demonstration. ")
         + "While training, actions carry noise and starts vary, so the rates here are lower than "
-        "in the trials below."
+        "in the trials below. Steps are small: so little data can keep or sharpen a good policy, "
+        "hardly better it."
     )
     plots: Plots = sections.learning_plots(rows, wanted)
-    return Section("Learning", [plots], text)
+    return Section("Learning", [plots, _candidates(training)], text)
+
+
+def _candidates(training: dict[str, Any]) -> Table:
+    """The states saved while training, and which one is the study's policy."""
+    trials, kept = training["selection"]["trials"], training["kept"]
+    rows: list[list[object]] = [
+        [c["iteration"], f"{100 * c['success']:.0f} %", c["return"], "yes" if i == kept else ""]
+        for i, c in enumerate(training["candidates"])
+    ]
+    return Table(
+        ["after iteration", "success", "mean return", "kept"],
+        rows,
+        f"The best of these, by success and then by return in {trials} trials each, is the "
+        f"fine-tuned policy. Those trials (seed {training['selection']['seed']}) are not among "
+        "the ones below.",
+    )
 
 
 def _video(root: Path, recording: Any) -> list[Block]:

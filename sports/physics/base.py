@@ -44,6 +44,8 @@ class Physics(Protocol):
     scene: Scene
     num_worlds: int
     device: torch.device
+    geometry: Geometry
+    """Support points of the scene's body."""
 
     qpos: Tensor
     """(N, nq)"""
@@ -55,6 +57,10 @@ class Physics(Protocol):
     """(N, A, B, 3) link origins p_WB."""
     body_quat: Tensor
     """(N, A, B, 4) link rotations R_WB."""
+    body_rot: Tensor
+    """(N, A, B, 3, 3) the same as matrices."""
+    felt: Tensor | None
+    """(N, A, 15 B - 2) proprioception of ``sports.frames``, where the engine knows a quick way."""
     body_linvel: Tensor
     """(N, A, B, 3) velocity of the link origins, world frame."""
     body_angvel: Tensor
@@ -158,17 +164,28 @@ class Geometry:
         return self.points[self.padded]  # (B, K', 3)
 
     @cached_property
+    def _point_columns(self) -> tuple[Tensor, Tensor, Tensor]:
+        x, y, z = self._padded_points.permute(2, 1, 0)[..., None].contiguous()
+        return x, y, z
+
+    @cached_property
     def _padded_radii(self) -> Tensor:
         return self.radii[self.padded]
 
-    def link_points(self, body_pos: Tensor, rotation: Tensor) -> Tensor:
-        """(..., B, K', 3) support points in the world, by link and padded by repetition to the
-        link with most; the balls around them have ``link_radii`` (B, K'). ``rotation`` is R_WB
-        (..., B, 3, 3)."""
-        # Written out: a batch of tiny matrix products is slow on a CPU.
-        x, y, z = rotation[..., None, :, :].unbind(-1)  # columns, (..., B, 1, 3)
-        px, py, pz = self._padded_points[..., None].unbind(-2)  # (B, K', 1)
-        return body_pos[..., None, :] + x * px + y * py + z * pz
+    def link_points(self, body_pos: Tensor, rotation: Tensor, axis: int) -> Tensor:
+        """(N, B, K') coordinate along a world axis of the support points, by link and padded by
+        repetition to the link with most; the balls around them have ``link_radii`` (B, K').
+        ``body_pos`` (N, B, 3) and ``rotation`` R_WB (N, B, 3, 3) are the links'."""
+        # Worlds in the last axis: rows of three numbers and tiny products are slow on a CPU.
+        x, y, z = rotation[:, :, axis].permute(2, 1, 0)  # (B, N) each
+        px, py, pz = self._point_columns  # (K', B, 1) each
+        points = torch.addcmul(body_pos[:, :, axis].T, x, px).addcmul_(y, py).addcmul_(z, pz)
+        return points.permute(2, 1, 0)
+
+    @staticmethod
+    def least(values: Tensor) -> Tensor:
+        """(N, B) least of each link's ``values`` (N, B, K')."""
+        return values.permute(2, 1, 0).amin(0).T
 
     @property
     def link_radii(self) -> Tensor:
@@ -180,20 +197,21 @@ class Geometry:
         pos, quat = body_pos[..., self.owner, :], body_quat[..., self.owner, :]
         return pos + quaternion.rotate(quat, self.points)
 
-    def center_of_mass(
-        self, physics: Physics, agent: int, rotation: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """(N, 3) centre of mass of an athlete (m) and (N, 3) its velocity (m/s), world frame.
-
-        ``rotation``: R_WB of the agent's links (N, B, 3, 3), where it is at hand.
-        """
-        if rotation is None:
-            rotation = quaternion.matrix(physics.body_quat[:, agent])
-        arm = (rotation @ self.center[..., None])[..., 0]  # (N, B, 3)
-        share = self.mass / self.mass.sum()
-        spin = quaternion.cross(physics.body_angvel[:, agent], arm)
-        position = share @ (physics.body_pos[:, agent] + arm)
-        return position, share @ (physics.body_linvel[:, agent] + spin)
+    def center_of_mass(self, physics: Physics, agent: int) -> tuple[Tensor, Tensor]:
+        """(N, 3) centre of mass of an athlete (m) and (N, 3) its velocity (m/s), world frame."""
+        # Components first, worlds last.
+        x, y, z = physics.body_rot[:, agent].permute(3, 2, 1, 0)  # columns, (3, B, N)
+        cx, cy, cz = self.center.T[..., None]  # (B, 1)
+        arm = torch.addcmul(x * cx, y, cy).addcmul_(z, cz)
+        pos, linear, (p, q, r) = (
+            v[:, agent].permute(2, 1, 0)
+            for v in (physics.body_pos, physics.body_linvel, physics.body_angvel)
+        )
+        a, b, c = arm
+        turning = torch.stack((q * c - r * b, r * a - p * c, p * b - q * a))
+        share = (self.mass / self.mass.sum())[:, None]
+        position, velocity = ((share * v).sum(1).T for v in (pos + arm, linear + turning))
+        return position, velocity
 
     def extent(self, body_pos: Tensor, body_quat: Tensor, direction: Tensor) -> Tensor:
         """(..., B) furthest reach along unit ``direction`` (3,) of each link, m."""
@@ -209,8 +227,6 @@ SPEED_LIMIT = 2000.0
 
 def diverged(qpos: Tensor, qvel: Tensor) -> Tensor:
     """(N,) worlds whose numbers are not finite or beyond any athlete or bar."""
-    return ~(
-        torch.isfinite(qpos).all(-1)
-        & torch.isfinite(qvel).all(-1)
-        & (qvel.abs().amax(-1) < SPEED_LIMIT)
-    )
+    # NaN is the largest of all, and not below any bound.
+    furthest, fastest = qpos.abs().amax(-1), qvel.abs().amax(-1)
+    return ~((furthest < torch.inf) & (fastest < SPEED_LIMIT))

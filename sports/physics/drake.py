@@ -30,7 +30,10 @@ from pydrake.multibody.tree import FixedOffsetFrame, RigidBody
 from pydrake.systems.framework import Context
 from torch import Tensor
 
+from sports import quaternion
 from sports.humanoid.drake_plant import (
+    OBJECT_DISSIPATION,
+    OBJECT_STIFFNESS,
     DrakeHumanoid,
     add_ground,
     add_humanoid,
@@ -68,6 +71,7 @@ class DrakePhysics:
     """
 
     engine = "drake"
+    felt = None
 
     def __init__(
         self,
@@ -306,6 +310,7 @@ class DrakePhysics:
         lin, ang = tensor(self._lin), tensor(self._ang)
         self.body_pos, self.object_pos = pos[:, :k].view(n, agents, links, 3), pos[:, k:]
         self.body_quat, self.object_quat = quat[:, :k].view(n, agents, links, 4), quat[:, k:]
+        self.body_rot = quaternion.matrix(self.body_quat)
         self.body_linvel, self.object_linvel = lin[:, :k].view(n, agents, links, 3), lin[:, k:]
         self.body_angvel, self.object_angvel = ang[:, :k].view(n, agents, links, 3), ang[:, k:]
         self.mocap_pos = tensor(self._mocap)
@@ -345,7 +350,7 @@ def _add_object(
         rigid,
         obj.name,
         obj.shapes,
-        contact_properties(obj.friction),
+        contact_properties(obj.friction, OBJECT_STIFFNESS, OBJECT_DISSIPATION),
         ground=obj.motion == "free" and obj.meets_ground,
     )
     points.extend(own[0])

@@ -23,6 +23,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from sports.physics.vectors import cross
+
+Bind = Callable[[str], np.ndarray]
+"""Gives a live (N, ...) array of an MjData field by its name."""
 GRAVITY = np.array((0.0, 0.0, -9.81))
 NO_FORCE = 0.1
 """A root force (N, N m) below this is rounding of self-contacts: the athlete touches nothing."""
@@ -46,27 +50,21 @@ def spatial_momentum(cinert: np.ndarray, cvel: np.ndarray) -> np.ndarray:
     return np.stack([row.sum(-1) for row in rows], axis=-1)
 
 
-def rotation(quat: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) matrix of unit quaternions (w, x, y, z)."""
-    w, x, y, z = np.moveaxis(quat, -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+def _rotate(w: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """(3, N) vectors ``v`` rotated by the unit quaternions of scalar ``w`` and vector ``u``."""
+    t = 2.0 * cross(u, v)
+    return v + w * t + cross(u, t)
 
 
-def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(N, 3) solution of N systems (N, 3, 3) by Cramer's rule; NaN, never an error, for the
-    world of an athlete whose inertia has become singular (it has diverged)."""
-    a, b, c = matrix[:, :, 0], matrix[:, :, 1], matrix[:, :, 2]
-    bc = np.cross(b, c)
-    with np.errstate(all="ignore"):
-        determinant = np.einsum("ni,ni->n", a, bc)[:, None]
-        rows = (bc, np.cross(c, a), np.cross(a, b))
-        numerator = np.stack([np.einsum("ni,ni->n", r, right) for r in rows], axis=1)
-        return numerator / determinant
+def _solve(inertia: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """(3, N) solution of N symmetric systems (6, N: xx, yy, zz, xy, xz, yz) by Cramer's rule;
+    NaN, never an error, for an athlete whose inertia has become singular (it has diverged)."""
+    xx, yy, zz, xy, xz, yz = inertia
+    x, y, z = right
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy  # the adjugate's rows
+    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    solution = np.stack((a * x + b * y + c * z, b * x + d * y + e * z, c * x + e * y + f * z))
+    return solution / (xx * a + xy * b + xz * c)
 
 
 @dataclass
@@ -96,15 +94,25 @@ class MomentumKeeper:
         """``timestep``: s, () or (N,); may be changed between substeps."""
         self.mass = mass
         self.timestep = timestep
-        self.target = np.full((num_worlds, 6), np.nan)
-        """(N, 6) momentum expected of the state measured next; NaN where unknown."""
-        self.path = np.full((num_worlds, 3), np.nan)
-        """(N, 3) where the centre of mass should be in that state; NaN where unknown."""
+        # Components first, so that each operation runs over all worlds.
+        self._target = np.full((6, num_worlds), np.nan)
+        self._path = np.full((3, num_worlds), np.nan)
+        self._weight = np.array((0.0, 0.0, 0.0, *(mass * GRAVITY)))[:, None]
+
+    @property
+    def target(self) -> np.ndarray:
+        """(N, 6) momentum expected of the state measured next; NaN where unknown. A view."""
+        return self._target.T
+
+    @property
+    def path(self) -> np.ndarray:
+        """(N, 3) where the centre of mass should be in that state; NaN where unknown. A view."""
+        return self._path.T
 
     def forget(self, ids: np.ndarray | slice) -> None:
         """The next measurement of these worlds is taken as it is (after a reset)."""
-        self.target[ids] = np.nan
-        self.path[ids] = np.nan
+        self._target[:, ids] = np.nan
+        self._path[:, ids] = np.nan
 
     def correct(self, tree: Tree, current: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What to add to the root after a substep.
@@ -116,38 +124,31 @@ class MomentumKeeper:
         Returns (N, 6) spatial velocity (rotation, then velocity of the centre of mass; world),
         (N, 6) the same as a change of the free joint's ``qvel``, (N, 3) shift of the root.
         """
-        h = np.broadcast_to(np.asarray(self.timestep, dtype=float), tree.com.shape[:1])[:, None]
-        momentum = np.concatenate((tree.angular, self.mass * tree.velocity), axis=1)
-        matrix = rotation(tree.root_quat)
-        arm = tree.root_pos - tree.com
-        force = tree.root_force[:, :3]
-        moment = np.einsum("nij,nj->ni", matrix, tree.root_force[:, 3:]) + np.cross(arm, force)
-        impulse = h * np.concatenate((moment, force + self.mass * GRAVITY), axis=1)
-        flying = (np.abs(tree.root_force).sum(1) < NO_FORCE)[:, None]
+        h = self.timestep
+        com, quat = np.ascontiguousarray(tree.com.T), np.ascontiguousarray(tree.root_quat.T)
+        wrench = np.ascontiguousarray(tree.root_force.T)
+        w, u = quat[0], quat[1:]
+        arm = tree.root_pos.T - com
+        momentum = np.concatenate((tree.angular.T, self.mass * tree.velocity.T))
+        flying = np.abs(wrench).sum(0) < NO_FORCE
+        force = wrench[:3]
+        moment = _rotate(w, u, wrench[3:]) + cross(arm, force)
+        impulse = h * (np.concatenate((moment, force)) + self._weight)
 
-        known = np.isfinite(self.target)
-        expected = self.target + impulse if current else self.target
-        error = np.where(known, expected - momentum, 0.0)
-        twist = np.empty_like(error)
-        tensor = tree.inertia[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
-        twist[:, :3] = _solve(tensor, error[:, :3])
-        twist[:, 3:] = error[:, 3:] / self.mass
-        self.target = momentum + error + (0.0 if current else impulse)
+        expected = self._target + impulse if current else self._target
+        np.copyto(expected, momentum, where=np.isnan(expected))
+        error = expected - momentum
+        spin = _solve(np.ascontiguousarray(tree.inertia.T), error[:3])
+        speed = error[3:] / self.mass
+        self._target = expected if current else expected + impulse
 
         # Position: the path of the momentum while nothing is touched.
-        velocity = (momentum + error)[:, 3:] / self.mass
-        here = self.path + h * velocity if current else self.path
-        shift = np.where(np.isfinite(here) & flying, here - tree.com, 0.0)
-        ahead = tree.com + shift
-        self.path = ahead if current else ahead + h * (self.target[:, 3:] / self.mass)
-        change = np.concatenate(
-            (
-                twist[:, 3:] + np.cross(twist[:, :3], arm),
-                np.einsum("nji,nj->ni", matrix, twist[:, :3]),
-            ),
-            axis=1,
-        )
-        return twist, change, shift
+        here = self._path + h * (expected[3:] / self.mass) if current else self._path
+        shift = np.where(flying & np.isfinite(here), here - com, 0.0)
+        ahead = com + shift
+        self._path = ahead if current else ahead + h * (self._target[3:] / self.mass)
+        change = np.concatenate((speed + cross(spin, arm), _rotate(w, -u, spin)))
+        return np.concatenate((spin, speed)).T, change.T, shift.T
 
 
 class AthleteKeeper:
@@ -160,19 +161,16 @@ class AthleteKeeper:
         keeper = AthleteKeeper(model, rows_of(data), "agent0/Pelvis")
 
     Call :meth:`correct` after every single substep: with ``current`` false after a plain
-    ``batch.step()`` or ``mj_step``, with ``current`` true after ``batch.step(stage=mjSTAGE_VEL)``
-    (or ``mj_step`` and ``mj_step1``'s stages again), which the last substep before the links are
-    read wants. It writes ``qpos`` and ``qvel``. Links read after a ``current`` correction were
-    computed before it: add the returned shift to their positions, the twist to ``cvel``. Call
-    :meth:`forget` for simulations whose state was set from outside.
+    ``batch.step()`` or ``mj_step``; with ``current`` true after the last substep before the links
+    are read, when the fields show the state that it led to, as they do after
+    ``batch.step(stage=mjSTAGE_VEL)`` or ``mj_step`` and ``mj_step1``. It writes ``qpos`` and
+    ``qvel``. Links read after a ``current`` correction were computed before it: add the returned
+    shift to their positions, the twist to ``cvel``. Call :meth:`forget` for simulations whose
+    state was set from outside.
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        bind: Callable[[str], np.ndarray],
-        root: str,
-        num_worlds: int | None = None,
+        self, model: mujoco.MjModel, bind: Bind, root: str, num_worlds: int | None = None
     ) -> None:
         """
         Args:
@@ -182,23 +180,27 @@ class AthleteKeeper:
             num_worlds: keep the first so many simulations; None for all.
 
         Raises:
-            ValueError: the model has no such body, or lacks its momentum sensors.
+            ValueError: the model lacks the athlete's momentum sensors.
         """
         names = [model.sensor(i).name for i in range(model.nsensor)]
-        missing = [s for s in (f"angmom:{root}", f"linvel:{root}") if s not in names]
-        if missing:
-            raise ValueError(f"the model has no sensor '{missing[0]}'; see sports.humanoid.mjcf")
-        body = model.body(root)
+        for name in (f"angmom:{root}", f"linvel:{root}"):
+            if name not in names:
+                raise ValueError(f"the model has no sensor '{name}'; see sports.humanoid.mjcf")
+        n, body = slice(num_worlds), model.body(root)
         q, v = model.jnt_qposadr[body.jntadr[0]], model.jnt_dofadr[body.jntadr[0]]
         spin, speed = (model.sensor(f"{k}:{root}").adr[0] for k in ("angmom", "linvel"))
-        n = slice(num_worlds)
+        sensors = bind("sensordata")
         self._pos, self._vel = bind("qpos")[n, q : q + 3], bind("qvel")[n, v : v + 6]
-        self._inertia = bind("crb")[n, body.id, :6]
-        self._angular = bind("sensordata")[n, spin : spin + 3]
-        self._velocity = bind("sensordata")[n, speed : speed + 3]
-        self._com = bind("subtree_com")[n, body.id]
-        self._root_pos, self._root_quat = bind("xpos")[n, body.id], bind("xquat")[n, body.id]
-        self._root_force = bind("qfrc_constraint")[n, v : v + 6]
+        self.tree = Tree(
+            inertia=bind("crb")[n, body.id, :6],
+            angular=sensors[n, spin : spin + 3],
+            velocity=sensors[n, speed : speed + 3],
+            com=bind("subtree_com")[n, body.id],
+            root_pos=bind("xpos")[n, body.id],
+            root_quat=bind("xquat")[n, body.id],
+            root_force=bind("qfrc_constraint")[n, v : v + 6],
+        )
+        """What the fields show; live."""
         mass = float(model.body_subtreemass[body.id])
         self.expected = MomentumKeeper(len(self._pos), mass, model.opt.timestep)
         """The momentum and the path expected, and the time step."""
@@ -209,8 +211,9 @@ class AthleteKeeper:
 
     def measured(self) -> np.ndarray:
         """(N, 9) as the fields show it: centre of mass (m), its velocity (m/s), angular momentum
-        about it (N m s); world frame. For a single ``MjData``, valid after ``mj_forward``."""
-        return np.concatenate((self._com, self._velocity, self._angular), axis=1)
+        about it (N m s); world frame. The fields must be current, as after ``mj_forward``."""
+        tree = self.tree
+        return np.concatenate((tree.com, tree.velocity, tree.angular), axis=1)
 
     def whole(self) -> np.ndarray:
         """(N, 9) the same as :meth:`measured`, of the state as a ``current`` :meth:`correct` has
@@ -219,21 +222,16 @@ class AthleteKeeper:
         speed = momentum[:, 3:] / self.expected.mass
         return np.concatenate((self.expected.path, speed, momentum[:, :3]), axis=1)
 
-    def correct(self, current: bool) -> tuple[np.ndarray, np.ndarray]:
+    def correct(self, current: bool, after: Tree | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Corrects the state after a substep; see the class.
+
+        ``after``: the athlete after the substep, for a ``current`` correction where the model's
+        fields do not show it.
 
         Returns (N, 6) the added spatial velocity (rotation, then velocity of the centre of mass,
         as ``cvel``; world) and (N, 3) the shift of the whole athlete.
         """
-        tree = Tree(
-            inertia=self._inertia,
-            angular=self._angular,
-            velocity=self._velocity,
-            com=self._com,
-            root_pos=self._root_pos,
-            root_quat=self._root_quat,
-            root_force=self._root_force,
-        )
+        tree = after or self.tree
         with np.errstate(all="ignore"):  # a simulation may have diverged
             twist, change, shift = self.expected.correct(tree, current)
             self._vel += change
@@ -241,6 +239,6 @@ class AthleteKeeper:
         return twist, shift
 
 
-def rows_of(data: mujoco.MjData) -> Callable[[str], np.ndarray]:
+def rows_of(data: mujoco.MjData) -> Bind:
     """Live arrays of one ``MjData`` as those of a batch of one, for :class:`AthleteKeeper`."""
     return lambda name: getattr(data, name)[None]

@@ -18,7 +18,7 @@ from torch import Tensor
 from sports.humanoid.mjcf import GROUND, body_name, build_model
 from sports.physics.base import Geometry, PhysicsState, diverged
 from sports.physics.momentum import GRAVITY, NO_FORCE
-from sports.physics.variation import Draw, Variation, draw
+from sports.physics.variation import Draw, Variation, contact_softness, draw
 from sports.scene import Scene
 
 ITERATIONS, LINE_SEARCH = 5, 8
@@ -208,6 +208,7 @@ class WarpPhysics:
     """The ``warp`` engine; see :class:`sports.physics.base.Physics` for the tensors."""
 
     engine = "warp"
+    felt = None
 
     def __init__(
         self,
@@ -264,6 +265,7 @@ class WarpPhysics:
         k, o = agents * links, len(scene.free_objects)
         xpos, xquat = view(d.xpos)[:, 1 : 1 + k + o], view(d.xquat)[:, 1 : 1 + k + o]
         self._cvel = view(d.cvel)[:, 1 : 1 + k + o]
+        self.body_rot = view(d.xmat)[:, 1 : 1 + k].unflatten(1, (agents, links))
         self._com = view(d.subtree_com)
         self._roots = torch.tensor(model.body_rootid[1 : 1 + k + o], device=self.device).long()
         self.body_pos = xpos[:, :k].unflatten(1, (agents, links))
@@ -373,9 +375,8 @@ class WarpPhysics:
         friction = rows(model.geom_friction)
         friction[:, :, 0] *= drawn.friction[:, None]
         m.geom_friction = wp.array(friction, dtype=wp.vec3)
-        solref = rows(model.geom_solref)
-        solref[:, :, 0] = drawn.contact_time[:, None]
-        m.geom_solref = wp.array(solref, dtype=wp.vec2)
+        softness = contact_softness(model.geom_solref, drawn).astype(np.float32)
+        m.geom_solref = wp.array(softness, dtype=wp.vec2)
         gain, bias = rows(model.actuator_gainprm), rows(model.actuator_biasprm)
         gain[:, :, 0] *= drawn.stiffness[:, None]
         bias[:, :, 1] *= drawn.stiffness[:, None]

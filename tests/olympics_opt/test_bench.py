@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from olympics_opt import bench
+from olympics_opt.meter import Meter, measure, summary
 from rl.ppo import PPOConfig
 from sports.env import make_env
 from sports.humanoid.mjcf import build_model
@@ -21,33 +22,45 @@ SMALL = PPOConfig(hidden=(16,), steps=6, minibatches=2, epochs=1)
 
 @pytest.fixture
 def meter():
-    env = make_env("high_jump", num_worlds=4, seed=3)
+    env = make_env("high_jump", num_worlds=4, seed=3, physics_options={"threads": 2})
     ticks = itertools.count()
     # A clock that advances one second between two looks: a block takes exactly one.
-    yield bench.Meter(env, steps=12, hyper=SMALL, clock=lambda: float(next(ticks)))
+    yield Meter(env, steps=12, hyper=SMALL, clock=lambda: float(next(ticks)))
     env.close()
 
 
-def test_bare_physics_takes_the_steps_it_reports(meter: bench.Meter) -> None:
-    env = meter.env
-    time = env.physics.batch.bind("time")
-    taken, stepped = 0.0, meter._bare
+def test_bare_physics_and_environment_take_the_same_steps(meter: Meter) -> None:
+    """Both go as far as they report, bare physics each time from the environment's states."""
+    env, bare = meter.env, meter._bare
+    period = env.physics.scene.control_timestep
+    time, qpos = bare.batch.bind("time"), bare.batch.bind("qpos")
+    stepped, env_step = bare.step, env.step
+    taken, steps = 0.0, 0
 
     def counted(targets: torch.Tensor) -> None:
         nonlocal taken
         before = time.copy()
+        np.testing.assert_array_equal(qpos, env.physics.extra_state()["qpos"].numpy())
         stepped(targets)
         taken += float((time - before).sum())
 
-    meter._bare = counted
-    before = {k: v.clone() for k, v in env.state_dict().items()}
-    rate = meter.bare_physics()
-    # 12 control steps in blocks of 8 and 4, one second of our clock each.
-    assert rate == pytest.approx(4 * 12 / 2)
-    assert taken == pytest.approx(4 * 12 * env.physics.scene.control_timestep)
-    after = env.state_dict()
-    for name, value in before.items():
-        torch.testing.assert_close(after[name], value, rtol=0, atol=0, equal_nan=True)
+    def counted_env(action: torch.Tensor):
+        nonlocal steps
+        steps += 1
+        clock = env.view.clock.clone()
+        result = env_step(action)
+        ended = result.terminated | result.truncated | ~result.valid
+        assert (env.view.clock == torch.where(ended, 0, clock + 1)).all()
+        # Without contacts that differ and momentum that drifts both have gone the same way.
+        far = np.abs(qpos - env.physics.extra_state()["qpos"].numpy())[~ended.numpy()]
+        assert far.max() < 0.05
+        return result
+
+    bare.step, env.step = counted, counted_env
+    rates = meter.pair()
+    # 12 blocks of one control step, one second of our clock each.
+    assert rates == {"bare_physics": pytest.approx(4), "environment": pytest.approx(4)}
+    assert taken == pytest.approx(4 * 12 * period) and steps == 12
 
 
 def plain_mujoco(physics, qpos, qvel, controls: torch.Tensor) -> torch.Tensor:
@@ -65,18 +78,23 @@ def plain_mujoco(physics, qpos, qvel, controls: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(np.array(rows)).float()
 
 
-def test_bare_physics_is_mujoco_and_nothing_else(meter: bench.Meter) -> None:
+def test_bare_physics_is_mujoco_and_nothing_else(meter: Meter) -> None:
     """The benchmark's yardstick leads where ``mj_step`` leads, on the environment's own model."""
-    env = meter.env
+    env, bare = meter.env, meter._bare
+    assert bare.batch.nthread == env.physics.threads == 2
     state, controls = env.physics.extra_state(), meter._controls[0]
     want = plain_mujoco(env.physics, state["qpos"], state["qvel"], controls)
-    meter._bare(controls)
-    got = torch.from_numpy(env.physics.batch.bind("qpos").copy()).float()
+    bare.take_over()
+    bare.step(controls)
+    got = torch.from_numpy(bare.batch.bind("qpos").copy()).float()
     assert torch.allclose(got, want, atol=1e-6)
     assert not torch.allclose(want, state["qpos"].float())
+    after = env.physics.extra_state()
+    for name, value in state.items():
+        torch.testing.assert_close(after[name], value, rtol=0, atol=0, equal_nan=True)
 
 
-def test_environment_and_training_count_their_samples(meter: bench.Meter) -> None:
+def test_training_counts_its_samples(meter: Meter) -> None:
     env = meter.env
     steps = 0
     step = env.step
@@ -87,11 +105,9 @@ def test_environment_and_training_count_their_samples(meter: bench.Meter) -> Non
         return step(action)
 
     env.step = counted
-    assert meter.environment() == pytest.approx(4 * 12)
-    assert steps == 12
     weights = meter.agent.actor.head.weight.detach().clone()
-    assert meter.training() == pytest.approx(4 * 6)
-    assert steps == 12 + 6
+    assert meter.training() == {"training": pytest.approx(4 * 6)}
+    assert steps == 6
     meter.training()
     assert not torch.equal(weights, meter.agent.actor.head.weight)
 
@@ -103,11 +119,11 @@ def test_shares_are_taken_within_a_turn() -> None:
         {"bare_physics": 100.0, "environment": 90.0},
         {"bare_physics": 1000.0, "environment": 910.0, "training": 780.0},
     ]
-    row = bench.summary(turns)
+    row = summary(turns)
     assert row["environment_share"] == pytest.approx(0.9)
     assert row["training_share"] == pytest.approx(0.79)
     assert row["spread"]["bare_physics"] == [100.0, 1000.0]
-    assert bench.summary([t for t in turns if "training" not in t])["training"] is None
+    assert summary([t for t in turns if "training" not in t])["training"] is None
 
 
 def test_file_holds_rows_and_where_they_come_from(
@@ -134,7 +150,7 @@ def test_mistakes_get_a_sentence(tmp_path: Path) -> None:
         bench.bench(tmp_path / "b.json", seconds=0)
     if not torch.cuda.is_available():
         with pytest.raises(RuntimeError, match="GPU"):
-            bench.measure("long_jump", "warp", worlds=1)
+            measure("long_jump", "warp", worlds=1)
     assert not list(tmp_path.iterdir())
 
 
@@ -143,12 +159,17 @@ def test_bare_warp_is_mujoco() -> None:
     pytest.importorskip("mujoco_warp")
     env = make_env("long_jump", engine="warp", num_worlds=2, physics_options={"device": "cpu"})
     try:
-        meter = bench.Meter(env, training=False, steps=2)
+        meter = Meter(env, training=False, steps=2)
         qpos, qvel = env.physics.qpos.clone(), env.physics.qvel.clone()
         env.load_state_dict(env.state_dict())  # making the meter has stepped the engine
         want = plain_mujoco(env.physics, qpos, qvel, meter._controls[0])
-        meter._bare(meter._controls[0])
+        before = env.state_dict()
+        meter._bare.take_over()
+        meter._bare.step(meter._controls[0])
         assert torch.allclose(env.physics.qpos, want, atol=1e-5)
         assert not torch.allclose(want, qpos, atol=1e-3)
+        meter._bare.give_back()
+        for name, value in env.state_dict().items():
+            torch.testing.assert_close(value, before[name], rtol=0, atol=0, equal_nan=True)
     finally:
         env.close()

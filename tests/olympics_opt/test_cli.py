@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from olympics_opt import cli
+from rl.ppo import PPOConfig
 from sports.registry import task_names
 
 HEAVY = ("pydrake", "casadi", "torch", "mujoco", "warp", "matplotlib", "OpenGL", "scipy")
@@ -30,6 +34,15 @@ def test_importing_the_command_line_is_light():
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("own", [None, "ACTIVE"])
+def test_waiting_threads_sleep_unless_the_user_says_otherwise(own, monkeypatch):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    if own is not None:
+        monkeypatch.setenv("OMP_WAIT_POLICY", own)
+    assert cli.main(["--version"]) == 0
+    assert os.environ["OMP_WAIT_POLICY"] == (own or "PASSIVE")
 
 
 def test_the_overview_lists_what_exists_and_nothing_else(capsys):
@@ -74,7 +87,7 @@ def test_options_of_a_task_reach_its_config():
         ("evaluate hi_jump --policy zero --out x.json", "unknown task 'hi_jump'"),
         ("evaluate hi_jump --policy zero --out x.json", "high_jump"),
         ("evaluate high_jump --policy zero --out x.json --task.bar 1", "--task.bar-height"),
-        ("evaluate high_jump --policy zero --out x.json --task.bar-height 99", "bar_height"),
+        ("evaluate high_jump --policy zero --out x.json --task.bar-height 99", "not 99.0"),
         ("evaluate high_jump --policy nowhere --out x.json", "no policy 'nowhere'"),
         ("evaluate high_jump --policy zero --out x.json --trials 0", "trials"),
         ("verify high_jump --policy zero --trials 0 --out x", "trials"),
@@ -82,7 +95,12 @@ def test_options_of_a_task_reach_its_config():
         ("solve pole_vault --out x", "unknown problem 'pole_vault'"),
         ("solve high_jump --out x --problem.bar 1", "--problem.bar-height"),
         ("solve high_jump --out x --problem.bar-height 9", "bar_height"),
+        ("solve high_jump --second-opinion --sweep bar-height=1:2:2 --out x", "leave out --sweep"),
         ("study tennis --out x", "tennis"),
+        ("export nowhere --out x.safetensors", "no run 'nowhere'"),
+        ("export . --out x.bin", "must end in .safetensors"),
+        ("export . --out x.safetensors", "no checkpoint yet"),
+        ("export . --result y.json --out x.safetensors", "y.json"),
         ("leaderboard --results nowhere", "nowhere"),
     ],
 )
@@ -113,8 +131,6 @@ def test_debug_shows_where(monkeypatch):
 
 
 def test_no_gpu_is_a_sentence(capsys, tmp_path):
-    import torch
-
     if torch.cuda.is_available():
         pytest.skip("this machine has a GPU")
     out = tmp_path / "x.json"
@@ -154,6 +170,76 @@ def test_evaluate_writes_the_schema_and_repeats_itself(tmp_path: Path):
     assert results[0] == results[1]
     success = results[0]["metrics"]["success"]
     assert success.keys() == {"mean", "ci95", "n", "unit"} and success["n"] == 3
+
+
+def finer_policy(folder: Path, **settings: object) -> Path:
+    """A small policy of the long jump whose card says at which time step it was trained."""
+    from rl.policy import export_policy
+    from rl.train import TrainConfig, train
+
+    small = PPOConfig(hidden=(16, 16), steps=4, minibatches=1, epochs=1)
+    config = TrainConfig("long_jump", folder / "run", worlds=2, samples=8, ppo=small, quiet=True)
+    train(dataclasses.replace(config, **settings))
+    return export_policy(folder / "run", folder / "policy")
+
+
+@pytest.mark.parametrize("divisor, vary", [(1, False), (2, True)])
+def test_every_policy_is_played_at_the_tasks_own_step(divisor, vary, tmp_path: Path, capsys):
+    """4 x 1/120 s whatever its card says, and a line where the card says something else."""
+    policy = finer_policy(tmp_path, timestep_divisor=divisor, vary=vary)
+    out = tmp_path / "x.json"
+    assert cli.main(f"evaluate long_jump --policy {policy} --trials 2 --out {out}".split()) == 0
+    text = capsys.readouterr().out
+    result = json.loads(out.read_text())
+    assert (result["timestep"], result["substeps"]) == (pytest.approx(1 / 120), 4)
+    assert "mujoco at 4 x 1/120 s" in text
+    assert ("note: the policy was trained at 8 x 1/240 s" in text) == (divisor == 2)
+    assert ("some of its worlds" in text) == vary
+
+
+def test_a_switch_before_the_name_is_not_taken_for_its_option():
+    config = cli.parse("solve", cli.COMMANDS["solve"], "--second-opinion high_jump --out y".split())
+    assert (config.name, config.second_opinion) == ("high_jump", True)
+    line = "--no-second-opinion high_jump --out y --problem.bar-height 1.2".split()
+    assert cli.chosen_options(cli.parse("solve", cli.COMMANDS["solve"], line), "problem") == {
+        "bar_height": 1.2
+    }
+
+
+def test_an_exported_policy_plays_like_its_run(tmp_path: Path, capsys):
+    """From a run to a policy file with its measured card, and on to fine-tuning with its critic."""
+    from rl.policy import load_policy
+    from rl.train import TrainConfig, train
+
+    run, out = tmp_path / "run", tmp_path / "policy.safetensors"
+    finer_policy(tmp_path)
+    line = f"evaluate long_jump --trials 2 --policy {run} --out {tmp_path / 'run.json'}"
+    assert cli.main(line.split()) == 0
+    line = f"export {run} --out {out} --critic --result {tmp_path / 'run.json'} --looks idle"
+    assert cli.main(line.split()) == 0
+    assert f"wrote {out}" in capsys.readouterr().out
+    policy, whole = load_policy(out, "long_jump"), load_policy(run, "long_jump")
+    result = json.loads((tmp_path / "run.json").read_text())
+    assert policy.metadata["metrics"] == result["metrics"]
+    assert policy.metadata["looks"] == "idle"
+    obs = 3.0 * torch.randn(20, 1, policy.metadata["obs_size"])
+    torch.testing.assert_close(policy(obs), whole(obs), atol=5e-3, rtol=5e-3)  # fp16
+    small = PPOConfig(hidden=(16, 16), steps=4, minibatches=1, epochs=1)
+    seen = []
+    tuned = TrainConfig(
+        "long_jump", tmp_path / "tuned", worlds=2, samples=8, init=str(out), ppo=small, quiet=True
+    )
+    train(tuned, on_iteration=seen.append)
+    assert seen[0]["kl"] > 0.0  # its actor learns at once: there is a critic
+
+    # An evaluation of the export is one of the run; that of another policy is refused.
+    again = f"export {run} --out {out} --critic --result {tmp_path / 'again.json'}"
+    for of, code in ((out, 0), (tmp_path / "tuned", 2)):
+        before, sha = out.read_bytes(), load_policy(of, "long_jump").metadata["sha256"]
+        (tmp_path / "again.json").write_text(json.dumps({**result, "policy_sha256": sha}))
+        assert cli.main(again.split()) == code
+        assert out.read_bytes() == before
+    assert "metrics are of another policy" in capsys.readouterr().err
 
 
 def test_evaluate_survives_no_place_to_write(tmp_path: Path, capsys):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from olympics_opt import cli
+from olympics_opt.fine_tune import FineTuning
 from olympics_opt.stages import Stage, run_stages
 from sports.humanoid.body import load_body
 from warmstart.certificate import Certificate
@@ -173,6 +174,7 @@ def test_a_whole_study_and_the_same_again(tmp_path: Path, line: list[str], monke
     monkeypatch.setattr(Certificate, "passed", property(lambda self: True))
     monkeypatch.setattr("warmstart.demonstration.track_best", track_once)
     monkeypatch.setattr("olympics_opt.render.render_video", no_gl)
+    monkeypatch.setattr("olympics_opt.study.TUNING", FineTuning(steps=8, trials=2))
     assert cli.main([*line, "--out", str(tmp_path)]) == 0
     page = (tmp_path / "report.html").read_text()
     assert "No video: install libegl1" in page  # and the rest of the report is whole

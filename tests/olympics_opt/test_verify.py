@@ -122,6 +122,8 @@ def test_standing_still_verifies_nothing_and_still_gets_its_report(tmp_path: Pat
     assert half == pytest.approx(whole / 2)
     page = (tmp_path / "report.html").read_text()
     assert "Parity of the models" in page and "replay-verify" in page
+    for step in ("4 x 1/120 s", "8 x 1/240 s", "16 x 1/480 s"):  # of the three runs
+        assert f">{step}<" in page
 
 
 def test_models_that_differ_are_not_scored(tmp_path: Path, monkeypatch, capsys):

@@ -198,6 +198,8 @@ def test_drake_trials_in_processes(processes):
     assert result.result["metrics"]["success"]["n"] == 4
     np.testing.assert_allclose(result.trials["bar_height"], [1.0, 1.5, 1.0, 1.5])
     assert len(result.median.qpos) in result.trials["episode_steps"]
+    assert result.result["timestep"] == pytest.approx(1 / 480)  # Drake's own, not the task's
+    assert result.result["timestep"] * result.result["substeps"] == pytest.approx(1 / 30)
     # standing at PD target zero ends by the stall rule at the same step in both engines
     mujoco = evaluate("zero", "high_jump", trials=4)
     np.testing.assert_array_equal(mujoco.trials["episode_steps"], result.trials["episode_steps"])

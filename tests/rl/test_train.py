@@ -70,6 +70,16 @@ def test_a_resumed_run_repeats_the_uninterrupted_one_bit_for_bit(tmp_path, task)
     assert [r["iteration"] for r in read_progress(tmp_path / "halves")] == [1, 2, 3, 4]
 
 
+def test_a_run_in_parts_is_the_run_in_one_piece(tmp_path):
+    """Schedules too: they follow the whole run, not the part."""
+    fading = dataclasses.replace(SMALL, sigma_final=0.1)
+    train(toy_config(tmp_path / "whole", ppo=fading), environment=toy_env)
+    parts = toy_config(tmp_path / "parts", ppo=fading, resume=True)
+    for part, iterations in ((0.5, 2), (0.6, 3), (1.0, 4)):
+        assert train(parts, environment=toy_env, part=part).iterations == iterations
+    same_bits(tmp_path / "whole", tmp_path / "parts")
+
+
 def start(out: Path, samples: int, *args: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "tests.rl.toy", str(out), str(samples), *args]
     env = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -151,6 +161,22 @@ def test_settings_that_contradict_a_run_are_refused(tmp_path):
             TrainConfig(task="toy", **bad)
     with pytest.raises(ValueError, match="--paper"):
         TrainConfig(task="toy", paper=True, ppo=SMALL)
+
+
+def test_a_command_line_resumes_a_run_with_the_runs_own_options(tmp_path, capsys):
+    """The plain command line continues; the same option again is no contradiction."""
+    out = ["high_jump", "--out", str(tmp_path / "run"), "--quiet"]
+    levels = ["--task.levels", "0.4", "0.6", "--task.bar-height", "1.2"]
+    small = ["--worlds", "2", "--ppo.hidden", "8", "--ppo.steps", "4", "--samples", "8"]
+    assert main([*out, *small, *levels]) == 0
+    for n, again in enumerate(([], ["--task.bar-height", "1.2"], levels), start=2):
+        assert main([*out, "--resume", "--samples", str(8 * n), *again]) == 0
+        own = json.loads((tmp_path / "run" / "config.json").read_text())["config"]["options"]
+        assert (own["bar_height"], own["levels"]) == (1.2, [0.4, 0.6])
+    assert [r["samples"] for r in read_progress(tmp_path / "run")] == [8, 16, 24, 32]
+    capsys.readouterr()
+    assert main([*out, "--resume", "--task.bar-height", "1.5"]) == 2
+    assert "bar_height 1.5 differs from the run's 1.2" in capsys.readouterr().err
 
 
 def test_fine_tuning_starts_from_the_policy(tmp_path):

@@ -77,8 +77,9 @@ def test_plain_mujoco_with_the_keeper_is_the_engine(forces):
                 mujoco.mj_step1(model, data)
             _, shift = keeper.correct(current=last)
         extra = physics.extra_state()
-        np.testing.assert_allclose(data.qpos, extra["qpos"][0], atol=1e-9)
-        np.testing.assert_allclose(data.qvel, extra["qvel"][0], atol=1e-8)
+        # The engine's own kinematics are in single precision; MuJoCo's here in double.
+        np.testing.assert_allclose(data.qpos, extra["qpos"][0], atol=1e-6)
+        np.testing.assert_allclose(data.qvel, extra["qvel"][0], atol=1e-4)
         pos = data.xpos[[model.body(f"agent0/{n}").id for n in scene.body.link_names]] + shift
         np.testing.assert_allclose(pos, physics.body_pos[0, 0], atol=1e-5)
         touched |= bool(physics.ground_force.any())

@@ -246,7 +246,7 @@ def test_worlds_that_vary_are_the_same_on_both_engines():
 def test_a_coarse_world_is_a_plain_world():
     """Two substeps in one, then one of length zero, against the usual time step. In the air, where
     only the instant of the momentum's correction differs."""
-    neutral = Variation((1, 1), (1, 1), (1, 1), (0.02, 0.02), coarse_share=1.0)
+    neutral = Variation((1, 1), (1, 1), (1, 1), (0.02, 0.02), (1, 1), coarse_share=1.0)
     fine = make_scene("long_jump", timestep_divisor=2)
     varied = cpu(fine, 2, variation=neutral)
     plain = cpu(make_scene("long_jump"), 2)
@@ -272,17 +272,71 @@ def test_resets_are_decided_by_the_seed():
 
 
 def test_a_saved_state_continues_bit_for_bit():
+    """Through falls and new starts, of which some are drawn before the state is saved."""
     generator = torch.Generator().manual_seed(2)
-    actions = 0.2 * torch.randn(24, 4, 1, 69, generator=generator)
+    actions = 0.2 * torch.randn(90, 4, 1, 69, generator=generator)
     first = make_env("high_jump", num_worlds=4, seed=1)
-    for action in actions[:12]:
-        first.step(action)
-    saved = {k: v.clone() for k, v in first.state_dict().items()}
+    falls = torch.zeros(2)
+    for action in actions[:45]:
+        falls[0] += first.step(action).terminated.sum()
+    saved = first.state_dict()
+    kept = {k: v.clone() for k, v in saved.items()}
     second = make_env("high_jump", num_worlds=4, seed=9)
     second.load_state_dict(saved)
-    for action in actions[12:]:
+    for action in actions[45:]:
         a, b = first.step(action), second.step(action)
+        falls[1] += a.terminated.sum()
         assert torch.equal(a.obs, b.obs) and torch.equal(a.reward, b.reward)
+    assert (falls >= 4).all()
+    for name, value in kept.items():
+        torch.testing.assert_close(saved[name], value, rtol=0, atol=0, equal_nan=True)
+
+
+def test_a_start_worked_out_ahead_is_a_reset():
+    """``prepare`` and ``restart`` of some worlds against ``reset`` of the same ones."""
+    scene = make_scene("high_jump")
+    generator = torch.Generator().manual_seed(5)
+    state = default_state(scene, 5, "cpu")
+    state.qpos[:, 7:76] += 0.2 * torch.randn(5, 69, generator=generator)
+    state.qvel += torch.randn(state.qvel.shape, generator=generator)
+    ahead, plain = cpu(scene, 5), cpu(scene, 5)
+    ctrl = 0.3 * torch.randn(5, scene.nu, generator=generator)
+    for physics in (ahead, plain):
+        for _ in range(3):
+            physics.step(ctrl)
+    prepared = ahead.prepare(state)
+    ahead.restart(torch.tensor([4, 1]), prepared)
+    plain.reset(torch.tensor([False, True, False, False, True]), state)
+    for _ in range(2):
+        for name in ("qpos", "qvel", "mocap_pos", "body_pos", "body_quat", "body_rot", "felt"):
+            assert torch.equal(getattr(ahead, name), getattr(plain, name)), name
+        for name in ("body_linvel", "body_angvel", "ground_force", "pair_force", "object_pos"):
+            assert torch.equal(getattr(ahead, name), getattr(plain, name)), name
+        for name, value in plain.extra_state().items():
+            got = ahead.extra_state()[name]
+            torch.testing.assert_close(got, value, rtol=0, atol=0, equal_nan=True)
+        ahead.step(ctrl)
+        plain.step(ctrl)
+
+
+def test_every_episode_starts_as_the_first():
+    """Without noise the observation after a fall is that of the reset; with it, each is new."""
+    env = make_env("long_jump", num_worlds=3, training=False)
+    noisy = make_env("long_jump", num_worlds=3, seed=4)
+    first = env.reset()
+    actions = 0.5 * torch.randn(60, 3, 1, 69, generator=torch.Generator().manual_seed(0))
+    starts, falls = [], 0
+    for action in actions:
+        result = env.step(action)
+        falls += int(result.terminated.sum())
+        assert torch.equal(result.obs[result.terminated], first[result.terminated])
+        assert torch.equal(result.obs[~result.terminated], result.final_obs[~result.terminated])
+        assert (env.view.clock[result.terminated] == 0).all()
+        result = noisy.step(action)
+        starts += list(result.obs[result.terminated].flatten(1))
+    assert falls >= 6 and len(starts) >= 6
+    starts = torch.stack(starts)
+    assert (torch.cdist(starts, starts) + 10 * torch.eye(len(starts)) > 0.05).all()
 
 
 def test_two_athletes_share_a_world():

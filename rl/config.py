@@ -1,0 +1,235 @@
+"""What a run of training is told: its settings, the worlds they make, their command line, and what
+a resume keeps."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from rl.checkpoint import checkpoints, read_state
+from rl.ppo import PAPER, PPOConfig
+from sports.env import Env, Starts, make_env
+from sports.physics.variation import Variation
+from sports.registry import get_task, task_names
+
+DEFAULT_WORLDS = {"mujoco": 256, "warp": 8192, "drake": 4}
+DEFAULT_SAMPLES = 100_000_000
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """What to train, on what, for how long."""
+
+    task: tyro.conf.Suppress[str] = ""
+    """Name of the task."""
+    out: Path = Path("runs/train")
+    """Folder of the run."""
+    algo: Literal["ppo"] = "ppo"
+    """Learner."""
+    engine: Literal["mujoco", "warp", "drake"] = "mujoco"
+    """Physics engine: mujoco needs no GPU, warp needs one, drake is for checking, not training."""
+    worlds: int | None = None
+    """Worlds per process; None for 256 on mujoco and 8192 on warp."""
+    samples: int | None = None
+    """Stop after this many samples; None for 100 M where no minutes are given."""
+    minutes: float | None = None
+    """Stop after this many minutes of training, earlier sessions of the run counted in."""
+    seed: int = 0
+    """Seed of weights, noise and environment."""
+    resume: bool = False
+    """Go on from the run's last checkpoint, with the run's own settings; a folder without one
+    begins afresh."""
+    strength: Literal["paper", "human"] = "paper"
+    """Torque limits of the athlete."""
+    limits: Literal["paper", "anatomical"] = "paper"
+    """Joint limits of the athlete."""
+    options: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
+    """The task's own options by name; on the command line ``--task.NAME``."""
+    physics_options: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
+    """Options of the engine."""
+    timestep_divisor: int = 1
+    """2 halves the physics time step at the same control rate."""
+    vary: bool = False
+    """Let the worlds differ in friction, gains and contact softness and, with
+    ``timestep_divisor`` 2, half of them run at the full time step: a policy that must hold in
+    every engine needs it."""
+    init: str | None = None
+    """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]."""
+    clips: tuple[Path, ...] = ()
+    """Demonstrations (npz) from whose frames episodes may start."""
+    start_probability: tuple[float, float] = (0.5, 0.1)
+    """Share of episodes that start from a demonstration, at the beginning and end of the run."""
+    imitation: float = 0.0
+    """Reward per step for moving exactly like the demonstrations; fades to 0 over
+    ``imitation_share`` of the run."""
+    imitation_share: float = 0.5
+    """Part of the run in which the imitation reward lasts."""
+    imitation_sharpness: float = 10.0
+    """The imitation reward falls with exp(-this x squared joint difference in rad^2)."""
+    paper: bool = False
+    """Use the hyper-parameters of the SMPLOlympics paper instead of ``ppo``."""
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    """Hyper-parameters."""
+    device: str = "auto"
+    """Where the networks live: auto (a GPU if there is one), cpu, cuda."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Of the matrix products: auto is bfloat16 on a GPU and float32 on a CPU, where bfloat16 is
+    about twice as fast if the processor has instructions for it, and slower if not."""
+    checkpoint_minutes: float = 2.0
+    """A checkpoint at least this often."""
+    checkpoint_iterations: int | None = None
+    """And after every so many iterations."""
+    cuda_graph: bool = True
+    """Replay the update as a CUDA graph where that is possible."""
+    quiet: bool = False
+    """Print nothing."""
+
+    def __post_init__(self) -> None:
+        for name in ("worlds", "samples", "minutes", "checkpoint_iterations"):
+            value = getattr(self, name)
+            if value is not None and value <= 0:
+                raise ValueError(f"{name} must be positive, not {value}")
+        if not all(0.0 <= p <= 1.0 for p in self.start_probability):
+            raise ValueError(f"start_probability must lie in [0, 1], not {self.start_probability}")
+        if self.paper and self.ppo != PPOConfig():
+            raise ValueError("--paper fixes the hyper-parameters: leave the --ppo options out")
+
+    @property
+    def hyper(self) -> PPOConfig:
+        """The hyper-parameters in force."""
+        return PAPER if self.paper else self.ppo
+
+    @property
+    def num_worlds(self) -> int:
+        """Worlds per process."""
+        return self.worlds or DEFAULT_WORLDS[self.engine]
+
+
+MakeEnv = Callable[[TrainConfig, int], Any]
+"""(config, seed) -> environment."""
+
+
+def default_env(config: TrainConfig, seed: int) -> Env:
+    """The config's task on its engine, in training mode."""
+    physics_options = dict(config.physics_options)
+    if config.vary:
+        physics_options |= {"variation": Variation(), "variation_seed": seed}
+    return make_env(
+        config.task,
+        engine=config.engine,
+        num_worlds=config.num_worlds,
+        seed=seed,
+        strength=config.strength,
+        limits=config.limits,
+        training=True,
+        options=config.options,
+        physics_options=physics_options,
+        timestep_divisor=config.timestep_divisor,
+    )
+
+
+def load_starts(paths: tuple[Path, ...], probability: float) -> Starts:
+    """Demonstration frames from clip files. Raises ValueError for a file that is not a clip."""
+    from warmstart.bank import ClipBank
+    from warmstart.clip import Clip
+
+    return ClipBank([Clip.load(path) for path in paths]).starts(probability=probability)
+
+
+FREE = {"out", "resume", "samples", "minutes", "quiet", "checkpoint_minutes"}
+FREE |= {"checkpoint_iterations", "device", "cuda_graph", "physics_options"}
+"""What a resumed run may change; everything else is the run's own."""
+
+
+def settle(config: TrainConfig) -> TrainConfig:
+    """The run's own settings on a resume. Raises ValueError where the caller's contradict them."""
+    if not config.task:
+        raise ValueError("train needs the name of a task")
+    saved = checkpoints(config.out)
+    if saved and not config.resume:
+        raise ValueError(
+            f"{config.out} already holds a run: add --resume to continue it, or give another --out"
+        )
+    if not saved:
+        return config
+    stored = config_from_dict(read_state(saved[-1])["card"]["config"])
+    plain = TrainConfig(task=config.task)
+    changes = {}
+    for f in dataclasses.fields(TrainConfig):
+        given, own = getattr(config, f.name), getattr(stored, f.name)
+        if f.name == "options":
+            _same_options(config.task, given, own)
+        elif f.name in FREE:
+            if given == getattr(plain, f.name) and f.name in ("samples", "minutes"):
+                changes[f.name] = own
+            else:
+                changes[f.name] = given
+        elif given != own and given != getattr(plain, f.name):
+            raise ValueError(
+                f"{f.name} {given!r} differs from the run's {own!r}: a resumed run keeps its "
+                "settings; leave it out, or start a new run in another --out"
+            )
+    if stored.task != config.task:
+        raise ValueError(f"{config.out} is a run of task '{stored.task}', not of '{config.task}'")
+    return replace(stored, **changes)
+
+
+def _same_options(task: str, given: dict[str, Any], own: dict[str, Any]) -> None:
+    """Raises ValueError where a task option that was asked for is not the run's.
+
+    The command line gives every option of the task, asked for or not, so that one at its default
+    asks for nothing; lists are what JSON made of the run's tuples.
+    """
+    plain = dataclasses.asdict(get_task(task).config()) if task in task_names() else {}
+    for name, value in given.items():
+        asked = json.loads(json.dumps(value))
+        default = json.loads(json.dumps(plain.get(name)))
+        if asked not in (default, own.get(name, default)):
+            raise ValueError(
+                f"{name} {value!r} differs from the run's {own.get(name, default)!r}: a resumed "
+                "run keeps its settings; leave it out, or start a new run in another --out"
+            )
+
+
+def config_from_dict(data: dict[str, Any]) -> TrainConfig:
+    """A TrainConfig from its JSON. Raises ValueError where it is not one."""
+    try:
+        data = dict(data)
+        ppo = dict(data.pop("ppo"))
+        for name in ("hidden", "kl_band", "learning_rate_limits"):
+            ppo[name] = tuple(ppo[name]) if ppo[name] is not None else None
+        data["out"] = Path(data["out"])
+        data["clips"] = tuple(Path(p) for p in data["clips"])
+        data["start_probability"] = tuple(data["start_probability"])
+        return TrainConfig(**data, ppo=PPOConfig(**ppo))
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"the run's settings cannot be read ({error})") from error
+
+
+def parse_args(args: list[str], prog: str = "python -m rl.train") -> TrainConfig:
+    """``TASK [options]`` -> TrainConfig; the task's options are ``--task.NAME``.
+
+    Raises ValueError for an unknown task; exits with code 2 and a message for other mistakes.
+    """
+    if not args or args[0].startswith("-"):
+        if not {"-h", "--help"} & set(args):
+            raise ValueError(f"say which task to train: {', '.join(task_names())}")
+        print(f"usage: {prog} TASK [options], TASK one of {', '.join(task_names())}\n")
+        tyro.cli(TrainConfig, args=args, prog=f"{prog} TASK")
+    name, options_type = args[0], get_task(args[0]).config
+
+    def command(run: TrainConfig, task: Any) -> TrainConfig:
+        given = {f.name: getattr(task, f.name) for f in dataclasses.fields(task)}
+        return replace(run, task=name, options=given)
+
+    command.__annotations__ = {
+        "run": Annotated[TrainConfig, tyro.conf.arg(name="")],
+        "task": options_type,
+    }
+    return tyro.cli(command, args=args[1:], prog=f"{prog} {name}")

@@ -1,0 +1,106 @@
+"""The process a run lives in: its signals, its clock, its device, its threads and its ranks."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+
+class Signals:
+    """SIGTERM and SIGINT ask the loop to save and stop; a second SIGINT interrupts at once."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Signals:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            try:
+                self._before[number] = signal.signal(number, self._hear)
+            except ValueError:  # not the main thread: the caller's business
+                break
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _hear(self, number: int, _frame: object) -> None:
+        if self._asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self._asked = True
+
+    def heard(self, device: torch.device) -> bool:
+        """Whether any rank was asked to stop; ``device`` is where the ranks talk."""
+        if not dist.is_initialized() or dist.get_world_size() == 1:
+            return self._asked
+        flag = torch.tensor([float(self._asked)], device=device)
+        dist.all_reduce(flag, op=dist.ReduceOp.MAX)
+        return bool(flag.item())
+
+
+class Stopwatch:
+    """Seconds between marks, on the device's own clock, without waiting for it."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._cuda = device.type == "cuda"
+        self._marks: list[Any] = []
+
+    def mark(self) -> None:
+        if self._cuda:
+            event = torch.cuda.Event(enable_timing=True)
+            event.record()
+            self._marks.append(event)
+        else:
+            self._marks.append(time.perf_counter())
+
+    def laps(self) -> list[float]:
+        """Seconds of each lap; the device must have passed the last mark."""
+        pairs = zip(self._marks[:-1], self._marks[1:])
+        if self._cuda:
+            self._marks[-1].synchronize()
+            return [a.elapsed_time(b) / 1000.0 for a, b in pairs]
+        return [b - a for a, b in pairs]
+
+
+def join_ranks() -> bool:
+    """Joins the process group that torchrun has prepared, if any; whether it did."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or dist.is_initialized():
+        return False
+    if torch.cuda.is_available():
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
+        dist.init_process_group("nccl")
+    else:
+        dist.init_process_group("gloo")
+    return True
+
+
+@contextmanager
+def one_torch_thread(device: torch.device) -> Iterator[None]:
+    """While an engine on the CPU plays: its own threads step the worlds, and torch's, awake between
+    their small tasks, would only take the cores from them. On a GPU nothing changes."""
+    threads = torch.get_num_threads()
+    if device.type == "cpu":
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def pick_device(name: str) -> torch.device:
+    """``auto`` (a GPU if there is one), ``cpu`` or ``cuda``. Raises ValueError without a GPU."""
+    if name != "auto":
+        if name.startswith("cuda") and not torch.cuda.is_available():
+            raise ValueError("there is no CUDA device here: use --device cpu")
+        return torch.device(name)
+    if torch.cuda.is_available():
+        return torch.device("cuda", torch.cuda.current_device())
+    return torch.device("cpu")

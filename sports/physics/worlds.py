@@ -1,0 +1,174 @@
+"""Worlds of C MuJoCo on native threads: what one thread of the ``mujoco`` engine drives.
+
+A control step is ``substeps`` calls of a batch, the momentum kept after each.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from sports.humanoid.mjcf import body_name
+from sports.physics.kinematics import Kinematics
+from sports.physics.momentum import AthleteKeeper, Tree
+from sports.physics.results import Display, Results
+from sports.physics.variation import Draw, contact_softness
+from sports.physics.vectors import cross
+from sports.scene import Scene
+
+
+class Worlds:
+    """Some worlds of a scene; ``out`` holds their results after every call."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        model: mujoco.MjModel,
+        kinematics: Kinematics,
+        threads: int,
+        out: Results,
+        drawn: Draw | None = None,
+    ) -> None:
+        """``model`` of ``mjcf``; ``drawn``: what makes the worlds differ."""
+        self.scene, self._kinematics = scene, kinematics
+        self._display = Display(scene, kinematics, out)
+        n, body = len(out.qpos), scene.body
+        self.batch = batch = Batch(model, nsim=n, nthread=threads)
+        self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
+        self.warmstart, self._ctrl = batch.bind("qacc_warmstart"), batch.bind("ctrl")
+        self._mocap = batch.bind("mocap_pos") if model.nmocap else np.zeros((n, 0, 3))
+        self._mocap_rows = [model.body(o.name).mocapid[0] for o in scene.mocap_objects]
+        self.keepers = [
+            AthleteKeeper(model, batch.bind, body_name(agent, body.link_names[0]))
+            for agent in range(scene.num_agents)
+        ]
+        self._peaks = _Peaks(batch.bind("sensordata"), out)
+        self._timesteps: list[np.ndarray] | None = None
+        self._solref = model.geom_solref
+        if drawn is not None:
+            self._vary(drawn)
+        batch.reset(stage=0)
+        self._fresh = batch.state[0].copy()
+        self.show()
+
+    def step(self, ctrl: np.ndarray) -> None:
+        """One control step with targets (n, nu)."""
+        self._ctrl[:] = ctrl
+        self._peaks.clear()
+        for i in range(self.scene.substeps):
+            if self._timesteps is not None:
+                self._timestep[:] = self._timesteps[i].reshape(self._timestep.shape)
+                for keeper in self.keepers:
+                    keeper.expected.timestep = self._timesteps[i]
+            self.batch.step()
+            with np.errstate(all="ignore"):  # worlds that diverge, found by the engine
+                self._peaks.look()
+                if i < self.scene.substeps - 1:
+                    for keeper in self.keepers:
+                        keeper.correct(current=False)
+        with np.errstate(all="ignore"):
+            for agent, keeper in enumerate(self.keepers):
+                self._finish(agent, keeper)
+            self._display.rest(slice(None), self.qpos, self.qvel, self._mocap_pos())
+        self._peaks.show()
+
+    def put(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
+        """Puts worlds ``ids`` into states (len(ids), ...), without showing them."""
+        self.batch.state[ids] = self._fresh
+        self.qpos[ids], self.qvel[ids] = qpos, qvel
+        for k, row in enumerate(self._mocap_rows):
+            self._mocap[ids, row] = mocap[:, k]
+        for keeper in self.keepers:
+            keeper.forget(ids)
+
+    def show(self) -> None:
+        """Shows a state that was set from outside."""
+        self._display.state(slice(None), self.qpos, self.qvel, self._mocap_pos())
+
+    def load(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        warmstart: np.ndarray,
+        target: np.ndarray,
+        path: np.ndarray,
+    ) -> None:
+        """Goes on from double-precision states, warm starts and expected momenta (A, n, ...)."""
+        self.qpos[:], self.qvel[:], self.warmstart[:] = qpos, qvel, warmstart
+        for keeper, expected, where in zip(self.keepers, target, path):
+            keeper.expected.target[:], keeper.expected.path[:] = expected, where
+        self.show()
+
+    def _mocap_pos(self) -> np.ndarray:
+        return self._mocap[:, self._mocap_rows]
+
+    def _vary(self, drawn: Draw) -> None:
+        """Gives each world its own numbers; see the ``warp`` engine."""
+        expand = self.batch.expand
+        expand("geom_friction")[:, :, 0] *= drawn.friction[:, None]
+        expand("geom_solref")[:] = contact_softness(self._solref, drawn)
+        expand("actuator_gainprm")[:, :, 0] *= drawn.stiffness[:, None]
+        expand("actuator_biasprm")[:, :, 1] *= drawn.stiffness[:, None]
+        damping = expand("dof_damping")
+        damping *= drawn.damping.reshape(-1, *[1] * (damping.ndim - 1))
+        if drawn.coarse.any():
+            h = self.scene.timestep
+            self._timestep = expand("opt.timestep")
+            double = np.where(drawn.coarse, 2 * h, h)
+            none = np.where(drawn.coarse, 0.0, h)
+            self._timesteps = [none if i % 2 else double for i in range(self.scene.substeps)]
+
+    def _finish(self, agent: int, keeper: AthleteKeeper) -> None:
+        """Corrects an athlete's momentum after the last substep and shows its links."""
+        qpos = self.qpos[:, self.scene.agent_qpos(agent)]
+        pose = self._kinematics.pose(qpos, self.qvel[:, self.scene.agent_qvel(agent)])
+        whole = self._kinematics.whole(pose)
+        after = Tree(
+            inertia=whole.inertia.T,
+            angular=whole.angular.T,
+            velocity=whole.velocity.T,
+            com=qpos[:, :3] + whole.com.T,
+            root_pos=qpos[:, :3],
+            root_quat=qpos[:, 3:7],
+            root_force=keeper.tree.root_force,
+        )
+        twist, _ = keeper.correct(True, after)
+        # The pose is of the velocities before the correction, which moves the athlete as a whole.
+        turn, speed = np.split(np.array(twist.T, np.float32, order="C"), 2)
+        pose.spin[:] += turn[:, None]
+        pose.velocity[:] += speed[:, None] + cross(turn[:, None], pose.pos - whole.com[:, None])
+        self._display.athlete(agent, slice(None), qpos[:, :3], pose)
+
+
+class _Peaks:
+    """Contact forces of those substeps of a control step in which they were largest."""
+
+    def __init__(self, sensors: np.ndarray, out: Results) -> None:
+        """``sensors`` (n, 3 k), live: first those of the ground, then those of the pairs."""
+        self._sensors, self._out = sensors, out
+        ground, pairs = out.ground_force.shape[1], len(out.pair_force)
+        self._split = (ground, ground + pairs)
+        self._force = np.zeros((len(sensors), sensors.shape[1] // 3, 3))
+        self._square = np.zeros(self._force.shape[:2])
+
+    def clear(self) -> None:
+        """Before the first substep."""
+        self._force[:] = 0.0
+        self._square[:] = 0.0
+        self._square[:, self._split[1] :] = np.inf  # the other sensors are no forces
+
+    def look(self) -> None:
+        """Takes a substep into account; numbers beyond all bounds are no forces."""
+        square = self._sensors * self._sensors
+        square = square[:, 0::3] + square[:, 1::3] + square[:, 2::3]
+        # Most sensors are silent: copy only where there is something new.
+        more = np.flatnonzero((square > self._square) & (square < 1e30))
+        self._square.ravel()[more] = square.ravel()[more]
+        self._force.reshape(-1, 3)[more] = self._sensors.reshape(-1, 3)[more]
+
+    def show(self) -> None:
+        """After the last substep."""
+        ground, last = self._split
+        self._out.ground_force[:] = self._force[:, :ground].T
+        self._out.pair_force[:] = np.sqrt(self._square[:, ground:last]).T
