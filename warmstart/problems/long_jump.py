@@ -35,7 +35,7 @@ RATE = jumper.RATE | {"L_Shoulder_z": (-12.0, 12.0), "R_Shoulder_z": (-12.0, 12.
 FOOT_SPEED, LIFT = 3.0, 0.8
 """Before its impact the take-off foot comes down at most so fast (m/s), and the impact gives the
 centre of mass at most so much upward speed (m/s): a quarter of the athlete, the distal mass of
-Seyfarth 1999 (J Biomech 32:1259), brought to rest. That longer jumps need it is known from there."""
+Seyfarth 1999 (J Biomech 32:1259), brought to rest, where faster legs are found to jump further."""
 LIMB_RATE = 18.0
 """Before the impact hinges turn at most so fast (rad/s): the speed at which hip and ankle of the
 strength table carry no load."""
