@@ -73,7 +73,13 @@ LIMITS: dict[str, tuple[str, float, str]] = {
 """Every check of every problem: sense, limit, unit. A recorded figure must only exist."""
 PROBLEM_LIMITS: dict[str, dict[str, tuple[str, float, str]]] = {
     "high_jump": {"clearance over the bar": (">=", 0.0, "m")},
-    "long_jump": {"foremost contact behind the line": (">=", 0.0, "m")},
+    "long_jump": {
+        "foremost contact behind the line": (">=", 0.0, "m"),
+        "touch-down: momentum residual": ("<=", 1e-3, "m/s"),
+        "touch-down: friction": ("<=", 1e-3, "m/s"),
+        "touch-down: energy gained": ("<=", 0.0, "J"),
+        "touch-down: upward speed gained": ("<=", 0.81, "m/s"),
+    },
 }
 
 
@@ -215,6 +221,7 @@ def certify(solution: Solution) -> Certificate:
         ("contact", lambda: _contact(solution)),
         ("geometry", lambda: _geometry(solution, notes)),
         ("outcome", lambda: _outcome(solution, achieved)),
+        ("touch-down", lambda: _touch_down(solution)),
         ("replay in mujoco", lambda: _replay(solution, "mujoco", achieved)),
         ("replay in drake", lambda: _replay(solution, "drake", achieved)),
     ]
@@ -352,6 +359,44 @@ def _geometry(solution: Solution, notes: dict[str, str]) -> dict[str, float]:
         "depth below the ground": max(depth, 0.0),
         "depth of self-contact": own,
         "beyond a joint limit": max(float(beyond.max()), 0.0),
+    }
+
+
+def _touch_down(solution: Solution) -> dict[str, float]:
+    """The impact before the first state, by MuJoCo: M (v - v before) = J' impulse.
+
+    Empty without an impact. Hinges that the motion holds are held through it too.
+    """
+    strike = solution.stats.get("touch_down")
+    if strike is None:
+        return {}
+    model = build_model(solution.body)
+    data = mujoco.MjData(model)
+    data.qpos[:] = solution.qpos[0]
+    mujoco.mj_forward(model, data)
+    mass, change = solution.body.mass, solution.qvel[0] - np.array(strike["qvel"])
+    momentum = np.zeros(model.nv)
+    mujoco.mj_mulM(model, data, momentum, change)
+    impulses = np.array(strike["impulse"])
+    here = [c for c in solution.contact_points if c[0].startswith(strike["side"])]
+    jac = np.zeros((3, model.nv))
+    for (link, point), impulse in zip(here, impulses, strict=True):
+        i = 1 + solution.body.link_index(link)
+        where = data.xpos[i] + data.xmat[i].reshape(3, 3) @ np.array(point)
+        mujoco.mj_jac(model, data, jac, None, where, i)
+        momentum -= jac.T @ impulse
+    free = np.ptp(solution.qpos[:, 7:], axis=0) > 1e-9
+    scale = np.repeat([mass, 0.5 * mass, 0.05 * mass], [3, 3, model.nv - 6])
+    residual = (np.abs(momentum) / scale)[np.concatenate([np.full(6, True), free])]
+    energy = np.zeros(model.nv)
+    mujoco.mj_mulM(model, data, energy, solution.qvel[0] + np.array(strike["qvel"]))
+    slope = humanoid_scene(solution.body).ground_friction
+    tangent = np.linalg.norm(impulses[:, :2], axis=1)
+    return {
+        "touch-down: momentum residual": float(residual.max()),
+        "touch-down: friction": float((tangent - slope * impulses[:, 2]).max()) / mass,
+        "touch-down: energy gained": 0.5 * float(change @ energy),
+        "touch-down: upward speed gained": float(impulses[:, 2].sum()) / mass,
     }
 
 

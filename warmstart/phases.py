@@ -65,3 +65,7 @@ class Bounds:
     friction_y: float = 0.5
     torque_share: float = 0.97
     """Share of the torque limit that the optimiser may use at knots."""
+
+    def limits(self) -> dict[str, float]:
+        """The bounds that no coordinate names: what a second opinion must use as well."""
+        return {k: v for k, v in vars(self).items() if isinstance(v, float)}

@@ -86,7 +86,8 @@ class StanceProgram:
     ) -> None:
         self.solution, self.stance = solution, last_stance(solution)
         self.weights = weights or Weights(**solution.stats.get("weights", {}))
-        self.bounds = bounds or Bounds(boxes(POSITION), boxes(RATE))
+        limits = solution.stats.get("bounds", {})
+        self.bounds = bounds or Bounds(boxes(POSITION), boxes(RATE), **limits)
         stance = self.stance
         keep = slice(stance.first, stance.last + 1)
         hinges = solution.qpos[:, 7:]
@@ -132,7 +133,10 @@ class StanceProgram:
             prog.AddBoundingBoxConstraint(self.q_ref[k], self.q_ref[k], self.q[k])
             prog.AddBoundingBoxConstraint(rate, rate, self.v[k])
             prog.AddBoundingBoxConstraint(acceleration, acceleration, self.a[k])
-        positions, rates = self._box(self.bounds.position), self._box(self.bounds.rate, self.bounds.hinge_rate)
+        positions, rates = (
+            self._box(self.bounds.position),
+            self._box(self.bounds.rate, self.bounds.hinge_rate),
+        )
         for k in range(1, K - 1):
             prog.AddBoundingBoxConstraint(*positions, self.q[k])
             prog.AddBoundingBoxConstraint(*(rate / RATE_SCALE for rate in rates), self.v[k])

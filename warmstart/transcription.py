@@ -517,6 +517,7 @@ class Transcription:
                 "status": result.status,
                 "variables": len(self.program.lower),
                 "weights": asdict(self.weights),
+                "bounds": self.bounds.limits(),
                 **self._touch_down_stats(x),
                 **stats,
             },

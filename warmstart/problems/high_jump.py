@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from sports.humanoid.body import Strength, load_body
+from sports.humanoid.body import load_body
 from warmstart.contact import Ball, outline
 from warmstart.nlp import Result
 from warmstart.phases import Bounds, Phase
@@ -34,23 +34,18 @@ _TRUNK = ("Chest", "Head", "L_Shoulder", "R_Shoulder")
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(jumper.Config):
     """Options of the high-jump problem."""
 
     bar_height: float = 1.0
     """Top of the bar above the ground (m)."""
-    strength: Strength = "human"
-    """Torque limits: ``human`` (with torque-speed lines) or ``paper``."""
     clearance: float = 0.04
     """Least distance of the body over the bar at knots (m)."""
     approach_speed: tuple[float, float] = (2.0, 7.0)
     """Forward speed of the centre of mass at touch-down of the take-off foot (m/s)."""
-    detail: float = 1.0
-    """Knots relative to the standard grid; below 1 solves faster and is less exact."""
-    max_iterations: int = 300
-    """IPOPT iterations before giving up."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0.3 <= self.bar_height <= 2.6:
             raise ValueError(
                 f"bar_height must lie between 0.3 and 2.6 m, not {self.bar_height}: the world "
@@ -58,12 +53,6 @@ class Config:
             )
         if not 0.0 <= self.clearance <= 0.3:
             raise ValueError(f"clearance must lie between 0 and 0.3 m, not {self.clearance}")
-        jumper.check_options(self.detail, self.max_iterations)
-        low, high = self.approach_speed
-        if not 0.0 <= low <= high <= 11.0:
-            raise ValueError(
-                f"approach_speed must be a range within 0..11 m/s, not {self.approach_speed}"
-            )
 
 
 def bar_clearance(ball: Ball, p_W, bar_height):
@@ -81,9 +70,9 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     higher = float(np.clip(config.bar_height - 1.2, 0.0, 0.4))
     turn = 2.0 * higher  # lies down over a high bar, and moves abruptly: finer knots
     phases = [
-        Phase("flat", knots(14), (0.09, 0.30), {"L": "flat"}),
-        Phase("toe", knots(8), (0.04, 0.15), {"L": "toe"}),
-        Phase("flight", knots(36 + round(80 * higher)), (0.30, 1.20), grading=3.0),
+        Phase("flat", knots(11), (0.09, 0.30), {"L": "flat"}),
+        Phase("toe", knots(7), (0.04, 0.15), {"L": "toe"}),
+        Phase("flight", knots(28 + round(80 * higher)), (0.30, 1.20), grading=3.0),
     ]
     position = jumper.boxes(jumper.POSITION) | {
         "x": (BAR_X - 5, BAR_X + 3),

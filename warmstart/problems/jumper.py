@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from sports.humanoid.body import Body
+from sports.humanoid.body import Body, Strength
 from warmstart.contact import Ball, outline
 from warmstart.nlp import Result
 from warmstart.phases import ELASTIC_REACH
@@ -74,12 +75,29 @@ RATE = {
 """Rate boxes of the root (m/s, rad/s)."""
 
 
-def check_options(detail: float, max_iterations: int) -> None:
-    """Raises ValueError for options that no jump accepts."""
-    if not 0.3 <= detail <= 4.0:
-        raise ValueError(f"detail must lie between 0.3 and 4, not {detail}")
-    if max_iterations < 1:
-        raise ValueError(f"max_iterations must be at least 1, not {max_iterations}")
+@dataclass(frozen=True)
+class Config:
+    """Options of both jumps. Raises ValueError for values that no jump accepts."""
+
+    strength: Strength = "human"
+    """Torque limits: ``human`` (with torque-speed lines) or ``paper``."""
+    approach_speed: tuple[float, float] = (2.0, 10.5)
+    """Forward speed of the centre of mass at touch-down of the take-off foot (m/s)."""
+    detail: float = 1.0
+    """Knots relative to the standard grid; below 1 solves faster and is less exact."""
+    max_iterations: int = 300
+    """IPOPT iterations before giving up."""
+
+    def __post_init__(self) -> None:
+        if not 0.3 <= self.detail <= 4.0:
+            raise ValueError(f"detail must lie between 0.3 and 4, not {self.detail}")
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations must be at least 1, not {self.max_iterations}")
+        low, high = self.approach_speed
+        if not 0.0 <= low <= high <= 11.0:
+            raise ValueError(
+                f"approach_speed must be a range within 0..11 m/s, not {self.approach_speed}"
+            )
 
 
 def scaled(detail: float) -> Callable[[int], int]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from sports.humanoid.body import Strength, load_body
+from sports.humanoid.body import load_body
 from warmstart.contact import outline
 from warmstart.nlp import Result
 from warmstart.phases import Bounds, Phase
@@ -35,30 +35,25 @@ RATE = jumper.RATE | {"L_Shoulder_z": (-12.0, 12.0), "R_Shoulder_z": (-12.0, 12.
 FOOT_SPEED, LIFT = 3.0, 0.8
 """Before its impact the take-off foot comes down at most so fast (m/s), and the impact gives the
 centre of mass at most so much upward speed (m/s): a quarter of the athlete, the distal mass of
-Seyfarth 1999 (J Biomech 32:1259), brought to rest. That longer jumps need it is known from there."""
+Seyfarth 1999 (J Biomech 32:1259), brought to rest, where faster legs are found to jump further."""
 LIMB_RATE = 18.0
 """Before the impact hinges turn at most so fast (rad/s): the speed at which hip and ankle of the
 strength table carry no load."""
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(jumper.Config):
     """Options of the long-jump problem."""
 
     length: float = 5.0
     """From the line to the rear-most heel at touch-down (m)."""
-    strength: Strength = "human"
-    """Torque limits: ``human`` (with torque-speed lines) or ``paper``."""
     board: float = 0.03
     """Distance of the take-off toe before the line, at least (m)."""
     approach_speed: tuple[float, float] = (3.0, 10.5)
     """Forward speed of the centre of mass at touch-down of the take-off foot (m/s)."""
-    detail: float = 1.0
-    """Knots relative to the standard grid; below 1 solves faster and is less exact."""
-    max_iterations: int = 300
-    """IPOPT iterations before giving up."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 1.0 <= self.length <= 9.5:
             raise ValueError(
                 f"length must lie between 1 and 9.5 m, not {self.length}: the world record is "
@@ -66,12 +61,6 @@ class Config:
             )
         if not 0.0 <= self.board <= 0.5:
             raise ValueError(f"board must lie between 0 and 0.5 m, not {self.board}")
-        jumper.check_options(self.detail, self.max_iterations)
-        low, high = self.approach_speed
-        if not 0.0 <= low <= high <= 11.0:
-            raise ValueError(
-                f"approach_speed must be a range within 0..11 m/s, not {self.approach_speed}"
-            )
 
 
 def transcribe(config: Config, elastic: bool = False) -> Transcription:
