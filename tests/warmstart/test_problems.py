@@ -176,7 +176,8 @@ def test_a_neighbour_is_a_start_point(jump):
     x = program.guess_from(jump)
     again = program.solution("high_jump", {}, _result(x))
     np.testing.assert_allclose(again.qpos, jump.qpos, atol=1e-6)
-    np.testing.assert_allclose(again.torque, jump.torque, atol=2.0)
+    # Accelerations are differentiated from the samples: 2 % of the limits of the trunk in flight.
+    np.testing.assert_allclose(again.torque, jump.torque, atol=5.0)
     wrong = long_jump.transcribe(long_jump.Config(detail=0.3))
     assert wrong.K != program.K and wrong.guess_from(jump).shape == (len(wrong.program.lower),)
 
