@@ -72,6 +72,11 @@ class TrainConfig:
     """Part of the run in which the imitation reward lasts."""
     imitation_sharpness: float = 10.0
     """The imitation reward falls with exp(-this x squared joint difference in rad^2)."""
+    impact: float = 0.0
+    """Cost per step of each body weight by which the ground's force on a link exceeds
+    ``impact_limit``: keeps motion off the hard impacts in which engines differ."""
+    impact_limit: float = 5.0
+    """Body weights of ground force on a link that cost nothing."""
     paper: bool = False
     """Use the hyper-parameters of the SMPLOlympics paper instead of ``ppo``."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -95,6 +100,8 @@ class TrainConfig:
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise ValueError(f"{name} must be positive, not {value}")
+        if self.impact < 0.0 or self.impact_limit < 0.0:
+            raise ValueError("impact and impact_limit must not be negative")
         if not all(0.0 <= p <= 1.0 for p in self.start_probability):
             raise ValueError(f"start_probability must lie in [0, 1], not {self.start_probability}")
         if self.paper and self.ppo != PPOConfig():

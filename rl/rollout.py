@@ -5,7 +5,7 @@ Shapes: T steps, N worlds, A agents, M = N A rows (agent fastest), D observation
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -65,7 +65,7 @@ def collect(
     obs: Tensor,
     gamma: float,
     on_step: Callable[[Any], None] | None = None,
-    bonus: Callable[[Any], Tensor] | None = None,
+    bonuses: Sequence[Callable[[Any], Tensor]] = (),
 ) -> Tensor:
     """Plays ``rollout.steps`` control steps into ``rollout`` without waiting for the device.
 
@@ -76,7 +76,8 @@ def collect(
         obs: (N, A, D) observation to begin with.
         gamma: discount, for the steps still paid after a terminal step.
         on_step: called with every StepResult, for statistics.
-        bonus: StepResult -> (N, A) unscaled reward added to the task's (the imitation term).
+        bonuses: StepResult -> (N, A) unscaled reward added to the task's: the imitation term, the
+            cost of impacts.
 
     Returns:
         (N, A, D) observation to go on from.
@@ -92,7 +93,7 @@ def collect(
         rollout.action[t], rollout.mean[t], rollout.log_prob[t] = action, mean, log_prob
         result = env.step(action.unflatten(0, (-1, agents)).to(env.device))
         valid = rows(result.valid)
-        reward = result.reward if bonus is None else result.reward + bonus(result)
+        reward = sum((bonus(result) for bonus in bonuses), result.reward)
         reward = reward.to(device).flatten() / env.reward_scale
         terminated = rows(result.terminated)
         steps_paid = torch.where(terminated, rows(result.remaining_paid), 0.0)

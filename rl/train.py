@@ -34,6 +34,7 @@ from rl.config import (
 )
 from rl.host import Signals, Stopwatch, join_ranks, one_torch_thread, pick_device
 from rl.imitation import Imitation
+from rl.impact import ImpactCost
 from rl.meter import EpisodeMeter
 from rl.policy import FORMAT as POLICY_FORMAT
 from rl.policy import load_policy
@@ -127,6 +128,9 @@ class _Trainer:
             if starts is None:
                 raise ValueError("the imitation reward needs demonstrations: give --clips")
             self.imitation = Imitation(self.env, config.imitation, config.imitation_sharpness)
+        self.bonuses: list[Callable[[Any], Tensor]] = [self.imitation] if self.imitation else []
+        if config.impact > 0.0:
+            self.bonuses.append(ImpactCost(self.env, config.impact, config.impact_limit))
         rows = self.env.num_worlds * self.env.num_agents
         self.agent = PPO(
             self.env.obs_size,
@@ -227,7 +231,7 @@ class _Trainer:
                 self.obs,
                 self.hyper.gamma,
                 on_step=self.meter,
-                bonus=self.imitation,
+                bonuses=self.bonuses,
             )
         clock.mark()
         losses: dict[str, Tensor] = {}
