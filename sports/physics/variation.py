@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sports.humanoid.mjcf import CONTACT_SOLREF
+
 _RANGES = ("friction", "stiffness", "damping", "contact_time", "contact_damping")
-DEFAULT_SOLREF = (0.02, 1.0)
-"""MuJoCo's contact time constant (s) and damping ratio."""
+_RANGES += ("contact_impedance",)
 
 
 @dataclass(frozen=True)
@@ -28,11 +29,13 @@ class Variation:
     """Factor of every servo stiffness."""
     damping: tuple[float, float] = (0.9, 1.1)
     """Factor of every joint damping."""
-    contact_time: tuple[float, float] = (0.006, 0.03)
-    """Time constant of contacts (s; 0.02 is MuJoCo's default), of geometries that state none of
-    their own. MuJoCo does not go below two time steps."""
-    contact_damping: tuple[float, float] = (0.6, 1.8)
-    """Damping ratio of the same contacts (1 is MuJoCo's default)."""
+    contact_time: tuple[float, float] = (0.006, 0.025)
+    """Time constant of the contacts of athletes and ground (s). MuJoCo does not go below two time
+    steps."""
+    contact_damping: tuple[float, float] = (0.5, 1.5)
+    """Damping ratio of the same contacts."""
+    contact_impedance: tuple[float, float] = (0.4, 0.8)
+    """Their impedance: the less, the more they yield to load."""
     coarse_share: float = 0.5
     """Share of worlds that take two substeps in one, where the scene has an even number: with
     ``timestep_divisor=2`` they run at the usual time step and the others at half of it."""
@@ -55,6 +58,7 @@ class Draw:
     damping: np.ndarray
     contact_time: np.ndarray
     contact_damping: np.ndarray
+    contact_impedance: np.ndarray
     coarse: np.ndarray
     """bool"""
 
@@ -72,9 +76,13 @@ def draw(variation: Variation, num_worlds: int, substeps: int, seed: int) -> Dra
     return Draw(*values, coarse=coarse & (substeps % 2 == 0) & (substeps > 4))
 
 
-def contact_softness(solref: np.ndarray, drawn: Draw) -> np.ndarray:
-    """(N, geoms, 2) ``solref`` of every world: the drawn time constant and damping ratio wherever
-    the model's (geoms, 2) are MuJoCo's own, else the model's."""
-    worlds = np.stack((drawn.contact_time, drawn.contact_damping), axis=-1)[:, None]
-    own = np.any(solref != DEFAULT_SOLREF, axis=-1)[None, :, None]
-    return np.where(own, solref[None], worlds)
+def contact_softness(
+    solref: np.ndarray, solimp: np.ndarray, drawn: Draw
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N, geoms, 2) ``solref`` and (N, geoms, 5) ``solimp`` of every world: as drawn for athletes
+    and ground, else the model's (geoms, 2) and (geoms, 5)."""
+    yields = np.all(np.isclose(solref, CONTACT_SOLREF), axis=-1)[None, :, None]
+    softness = np.stack((drawn.contact_time, drawn.contact_damping), axis=-1)[:, None]
+    impedance = np.repeat(solimp[None], len(drawn.contact_impedance), axis=0)
+    impedance[..., :2] = drawn.contact_impedance[:, None, None]
+    return np.where(yields, softness, solref[None]), np.where(yields, impedance, solimp[None])

@@ -375,8 +375,9 @@ class WarpPhysics:
         friction = rows(model.geom_friction)
         friction[:, :, 0] *= drawn.friction[:, None]
         m.geom_friction = wp.array(friction, dtype=wp.vec3)
-        softness = contact_softness(model.geom_solref, drawn).astype(np.float32)
-        m.geom_solref = wp.array(softness, dtype=wp.vec2)
+        solref, solimp = contact_softness(model.geom_solref, model.geom_solimp, drawn)
+        m.geom_solref = wp.array(solref.astype(np.float32), dtype=m.geom_solref.dtype)
+        m.geom_solimp = wp.array(solimp.astype(np.float32), dtype=m.geom_solimp.dtype)
         gain, bias = rows(model.actuator_gainprm), rows(model.actuator_biasprm)
         gain[:, :, 0] *= drawn.stiffness[:, None]
         bias[:, :, 1] *= drawn.stiffness[:, None]

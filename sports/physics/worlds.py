@@ -45,7 +45,7 @@ class Worlds:
         ]
         self._peaks = _Peaks(batch.bind("sensordata"), out)
         self._timesteps: list[np.ndarray] | None = None
-        self._solref = model.geom_solref
+        self._softness = model.geom_solref, model.geom_solimp
         if drawn is not None:
             self._vary(drawn)
         batch.reset(stage=0)
@@ -107,7 +107,8 @@ class Worlds:
         """Gives each world its own numbers; see the ``warp`` engine."""
         expand = self.batch.expand
         expand("geom_friction")[:, :, 0] *= drawn.friction[:, None]
-        expand("geom_solref")[:] = contact_softness(self._solref, drawn)
+        softness = contact_softness(*self._softness, drawn)
+        expand("geom_solref")[:], expand("geom_solimp")[:] = softness
         expand("actuator_gainprm")[:, :, 0] *= drawn.stiffness[:, None]
         expand("actuator_biasprm")[:, :, 1] *= drawn.stiffness[:, None]
         damping = expand("dof_damping")
