@@ -83,20 +83,21 @@ def proprioception(physics: Physics, heading: Heading, more: Sequence[Tensor] = 
     """
     n, agents, links = physics.body_pos.shape[:3]
     at = 15 * links - 2
-    size = at + sum(features.shape[-1] for features in more)
-    rows = physics.body_pos.new_empty(agents, size, n)
-    if physics.felt is not None:
-        rows[:, :at] = physics.felt.permute(1, 2, 0)
-    else:
+    obs = physics.body_pos.new_empty(n, agents, at + sum(f.shape[-1] for f in more))
+    felt = physics.felt
+    if felt is None:
         pos, linvel, angvel = (
             v.permute(1, 3, 2, 0)
             for v in (physics.body_pos, physics.body_linvel, physics.body_angvel)
         )
         rot = physics.body_rot.permute(1, 3, 4, 2, 0)
+        rows = physics.body_pos.new_empty(agents, at, n)
         for a in range(agents):
             cos, sin = heading.cos[:, a], heading.sin[:, a]
-            fill_proprioception(rows[a, :at], cos, sin, pos[a], rot[a], linvel[a], angvel[a])
+            fill_proprioception(rows[a], cos, sin, pos[a], rot[a], linvel[a], angvel[a])
+        felt = rows.permute(2, 0, 1)
+    obs[..., :at] = felt
     for features in more:
-        rows[:, at : at + features.shape[-1]] = features.permute(1, 2, 0)
+        obs[..., at : at + features.shape[-1]] = features
         at += features.shape[-1]
-    return rows.flatten(0, 1).T.contiguous().unflatten(1, (agents, -1))
+    return obs
