@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sports import quaternion
 from sports.physics.base import Physics
 
 Array = Any
@@ -23,9 +22,9 @@ Array = Any
 class Heading:
     """Rotates world vectors into the heading frames of the athletes."""
 
-    def __init__(self, root_quat: Tensor) -> None:
-        """``root_quat`` (N, A, 4)."""
-        angle = quaternion.yaw(root_quat)
+    def __init__(self, root_rot: Tensor) -> None:
+        """``root_rot`` (N, A, 3, 3) R_WB."""
+        angle = torch.atan2(root_rot[..., 1, 0], root_rot[..., 0, 0])
         self.cos, self.sin = torch.cos(angle), torch.sin(angle)
 
     def local(self, v: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sports.humanoid.mjcf import build_model
-from sports.physics.base import Geometry, PhysicsState, default_state, diverged
+from sports.physics.base import Geometry, PhysicsState, default_state
 from sports.physics.kinematics import Kinematics
 from sports.physics.results import Display, Results, Shown
 from sports.physics.variation import Variation, draw
@@ -61,7 +61,7 @@ class MujocoPhysics:
 
     def step(self, ctrl: Tensor) -> None:
         self._worlds.step(ctrl.numpy())
-        self.bad = diverged(self.qpos, self.qvel)
+        self.bad = torch.from_numpy(self._out.diverged())
         if self.bad.any():
             self.nan_worlds += int(self.bad.sum())
             safe = default_state(self.scene, self.num_worlds, self.device)
@@ -73,7 +73,7 @@ class MujocoPhysics:
         if ids.size:
             rows = [x.numpy()[ids] for x in (state.qpos, state.qvel, state.mocap_pos)]
             self._worlds.put(ids, *rows)
-            self._out.put(ids, self._results(*rows), slice(None))
+            self._out.put(ids, self._results(*rows).by_world)
 
     def prepare(self, state: PhysicsState) -> Shown:
         """What every world would show after a reset to its row of ``state``, for ``restart``:
@@ -84,9 +84,9 @@ class MujocoPhysics:
     def restart(self, worlds: Tensor, prepared: Shown) -> None:
         """Resets worlds (n,), by index, to what was prepared."""
         ids, out = worlds.numpy(), prepared.results
-        state = (x[..., ids] for x in (out.qpos, out.qvel, out.mocap_pos))
-        self._worlds.put(ids, *(np.moveaxis(x, -1, 0) for x in state))
-        self._out.put(ids, out, ids)
+        rows = out.by_world[ids]
+        self._worlds.put(ids, *out.states(rows))
+        self._out.put(ids, rows)
 
     def _results(self, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> Results:
         """Of states (n, nq), (n, nv), (n, M, 3) without contacts."""

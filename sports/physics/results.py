@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sports.frames import fill_proprioception
-from sports.physics.base import Geometry
+from sports.physics.base import SPEED_LIMIT, Geometry
 from sports.physics.kinematics import Kinematics, Pose
 from sports.physics.vectors import rotation
 from sports.scene import Scene
@@ -80,9 +81,25 @@ class Results:
         self.pair_force = parts["pair_force"]
         """(P, N) as ``Physics.pair_force``"""
 
-    def put(self, worlds: np.ndarray, other: Results, rows: np.ndarray | slice) -> None:
-        """Makes worlds, by index, those ``rows`` of other results."""
-        self._all[:, worlds] = other._all[:, rows]
+    @cached_property
+    def by_world(self) -> np.ndarray:
+        """(N, ...) a copy with the worlds first, quick to pick a few from."""
+        return np.ascontiguousarray(self._all.T)
+
+    def states(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """qpos (n, nq), qvel (n, nv) and mocap_pos (n, M, 3) in rows of ``by_world``."""
+        nq, nv, moved = len(self.qpos), len(self.qvel), self.mocap_pos.size // self.num_worlds
+        qpos, qvel, mocap, _ = np.split(rows, np.cumsum((nq, nv, moved)), axis=1)
+        return qpos, qvel, mocap.reshape(len(rows), moved // 3, 3)
+
+    def put(self, worlds: np.ndarray, rows: np.ndarray) -> None:
+        """Makes worlds, by index, those of some rows of ``by_world``."""
+        self._all[:, worlds] = rows.T
+
+    def diverged(self) -> np.ndarray:
+        """(N,) bool, as ``sports.physics.base.diverged``."""
+        furthest, fastest = np.abs(self.qpos).max(0), np.abs(self.qvel).max(0)
+        return ~((furthest < np.inf) & (fastest < SPEED_LIMIT))
 
     def pose(self, agent: int) -> Pose:
         """Of the athlete; views."""

@@ -55,7 +55,6 @@ class Worlds:
     def step(self, ctrl: np.ndarray) -> None:
         """One control step with targets (n, nu)."""
         self._ctrl[:] = ctrl
-        self._peaks.clear()
         for i in range(self.scene.substeps):
             if self._timesteps is not None:
                 self._timestep[:] = self._timesteps[i].reshape(self._timestep.shape)
@@ -153,24 +152,28 @@ class _Peaks:
         ground, pairs = out.ground_force.shape[1], len(out.pair_force)
         self._ground, self._out = ground, out
         self._sensors = sensors[:, : 3 * (ground + pairs)].T
-        self._force = np.zeros((ground + pairs, 3, len(sensors)), np.float32)
-        self._square = np.zeros((ground + pairs, len(sensors)), np.float32)
-
-    def clear(self) -> None:
-        """Before the first substep."""
-        self._force[:] = 0.0
-        self._square[:] = 0.0
+        self._largest: tuple[np.ndarray, np.ndarray] | None = None
 
     def look(self) -> None:
-        """Takes a substep into account; numbers beyond all bounds are no forces."""
-        force = self._sensors.astype(np.float32, order="C").reshape(self._force.shape)
+        """Takes a substep into account."""
+        force = self._sensors.astype(np.float32, order="C").reshape(-1, 3, self._out.num_worlds)
         square = force * force
         square = square[:, 0] + square[:, 1] + square[:, 2]
-        more = (square > self._square) & (square < 1e30)
-        np.copyto(self._square, square, where=more)
-        np.copyto(self._force, force, where=more[:, None])
+        if self._largest is None:
+            self._largest = force, square
+            return
+        largest, peak = self._largest
+        more = square > peak
+        np.copyto(peak, square, where=more)
+        np.copyto(largest, force, where=more[:, None])
 
     def show(self) -> None:
-        """After the last substep."""
-        self._out.ground_force[:] = self._force[: self._ground].swapaxes(0, 1)
-        self._out.pair_force[:] = np.sqrt(self._square[self._ground :])
+        """After the last substep. Numbers beyond all bounds are no forces."""
+        assert self._largest is not None
+        force, square = self._largest
+        wild = ~(square < 1e30)
+        if wild.any():
+            force[np.broadcast_to(wild[:, None], force.shape)] = square[wild] = 0.0
+        self._out.ground_force[:] = force[: self._ground].swapaxes(0, 1)
+        self._out.pair_force[:] = np.sqrt(square[self._ground :])
+        self._largest = None
