@@ -64,17 +64,22 @@ class Kinematics:
         self._offset = _columns(model.body_pos[ids[1:]])
         self._center = _columns(model.body_ipos[ids])
         mass = model.body_mass[ids]
-        self._share = (mass / mass.sum()).astype(np.float32)[:, None]
+        self._share = (mass / mass.sum()).astype(np.float32)
         self._root_mass = np.sqrt(mass).astype(np.float32)[:, None]
-        # A link's second moment of mass about its centre is S = F F^T, its inertia trace(S) - S.
+        # A link's second moment of mass about its centre is S = s + F F^T with s its least
+        # eigenvalue and F (3, 2); its inertia is trace(S) - S.
         half = model.body_inertia[ids].sum(1, keepdims=True) / 2
-        widths = np.sqrt(np.maximum(half - model.body_inertia[ids], 0.0))
+        moments = half - model.body_inertia[ids]
+        least = moments.min(1, keepdims=True)
         axes = np.empty((len(ids), 9))
         for k, i in enumerate(ids):
             mujoco.mju_quat2Mat(axes[k], model.body_iquat[i])
-        factor = axes.reshape(-1, 3, 3) * widths[:, None]
-        self._factor = np.ascontiguousarray(np.moveaxis(factor, 0, 2)[..., None], np.float32)
-        self._trace = half.astype(np.float32)
+        factor = axes.reshape(-1, 3, 3) * np.sqrt(moments - least)[:, None]
+        wide = np.argsort(moments, axis=1)[:, None, 1:]
+        factor = np.take_along_axis(factor, np.repeat(wide, 3, axis=1), axis=2)
+        self._factor = np.ascontiguousarray(np.moveaxis(factor, 0, 2), np.float32)
+        self._inertia = (half - least)[:, 0].astype(np.float32)
+        self._least = np.float32(least.sum())
 
     def pose(self, qpos: np.ndarray, qvel: np.ndarray, out: Pose) -> None:
         """Of the athlete's qpos (7 + 3 (B - 1), n) and qvel (6 + 3 (B - 1), n), float32."""
@@ -92,15 +97,13 @@ class Kinematics:
         factors, quat = turn[_PART], out.quat
         np.divide(qpos[3:7], np.sqrt((qpos[3:7] * qpos[3:7]).sum(0)), out=quat[:, 0])
         for i, j in enumerate(parent):
-            np.add.reduce(quat[:, j, None] * factors[:, :, i], axis=0, out=quat[:, i + 1])
+            np.einsum("kn,kmn->mn", quat[:, j], factors[:, :, i], out=quat[:, i + 1])
 
         rot = rotation(quat, out.rot)
         base, own = rot[:, :, parent], rot[:, :, 1:]  # of the links' parents, and their own
         parts = np.empty((6, len(parent), n), np.float32)
         arm, about = parts[:3], parts[3:]
-        np.multiply(base[:, 0], self._offset[0], out=arm)
-        arm += base[:, 1] * self._offset[1]
-        arm += base[:, 2] * self._offset[2]
+        np.einsum("ijbn,jb->ibn", base, self._offset, out=arm)
         # Hinge axes: x of the parent, z of the link, and between them y turned back about z.
         np.multiply(base[:, 0], rate[0], out=about)
         about += own[:, 0] * (2.0 * sc * cc * rate[1])
@@ -109,7 +112,7 @@ class Kinematics:
 
         pos, spin, velocity = out.pos, out.spin, out.velocity
         pos[:, 0], velocity[:, 0] = 0.0, qvel[:3]
-        np.add.reduce(rot[:, :, 0] * qvel[3:6], axis=1, out=spin[:, 0])
+        np.einsum("ijn,jn->in", rot[:, :, 0], qvel[3:6], out=spin[:, 0])
         self._sum_up(pos, arm)
         self._sum_up(spin, about)
         self._sum_up(velocity, cross(spin[:, parent], arm))
@@ -118,30 +121,25 @@ class Kinematics:
         """Mass properties and momentum of poses."""
         rot, spin = pose.rot, pose.spin
         links, n = spin.shape[1:]
-        arm = rot[:, 0] * self._center[0]
-        arm += rot[:, 1] * self._center[1]
-        arm += rot[:, 2] * self._center[2]
         # Second moments of the whole: those of the links and of points at their centres.
-        moments = np.empty((3, 4, links, n), np.float32)
-        factor, center = moments[:, :3], moments[:, 3]
-        np.multiply(rot[:, 0, None], self._factor[0], out=factor)
-        factor += rot[:, 1, None] * self._factor[1]
-        factor += rot[:, 2, None] * self._factor[2]  # R F
+        moments = np.empty((3, 3, links, n), np.float32)
+        factor, center = moments[:, :2], moments[:, 2]
+        np.einsum("ijbn,jkb->ikbn", rot, self._factor, out=factor)  # R F
+        arm = np.einsum("ijbn,jb->ibn", rot, self._center)
         np.add(pose.pos, arm, out=center)
         velocity = cross(spin, arm)
         velocity += pose.velocity
-        com, mean = (center * self._share).sum(1), (velocity * self._share).sum(1)
+        com, mean = (np.einsum("b,ibn->in", self._share, v) for v in (center, velocity))
         center -= com[:, None]
         velocity -= mean[:, None]
         center *= self._root_mass
         velocity *= self._root_mass
-        along = (factor * spin[:, None]).sum(0)
-        angular = cross(center, velocity)
-        angular += self._trace * spin
-        angular = angular.sum(1) - (factor * along).sum((1, 2))
+        angular = cross(center, velocity).sum(1)
+        angular += np.einsum("b,ibn->in", self._inertia, spin)
+        angular -= np.einsum("ikbn,kbn->in", factor, np.einsum("ikbn,ibn->kbn", factor, spin))
         x, y, z = moments.reshape(3, -1, n)
-        xx, yy, zz = ((v * v).sum(0) for v in (x, y, z))
-        xy, xz, yz = ((a * b).sum(0) for a, b in ((x, y), (x, z), (y, z)))
+        xx, yy, zz = (np.einsum("kn,kn->n", v, v) + self._least for v in (x, y, z))
+        xy, xz, yz = (np.einsum("kn,kn->n", a, b) for a, b in ((x, y), (x, z), (y, z)))
         return Whole(np.stack((yy + zz, xx + zz, xx + yy, -xy, -xz, -yz)), angular, mean, com)
 
     def _sum_up(self, total: np.ndarray, part: np.ndarray) -> None:
@@ -151,5 +149,5 @@ class Kinematics:
 
 
 def _columns(values: np.ndarray) -> np.ndarray:
-    """(3, B, 1) float32 of (B, 3)."""
-    return np.array(values.T[..., None], np.float32, order="C")
+    """(3, B) float32 of (B, 3)."""
+    return np.array(values.T, np.float32, order="C")

@@ -58,7 +58,8 @@ def _solve(inertia: np.ndarray, right: np.ndarray) -> np.ndarray:
     NaN, never an error, for an athlete whose inertia has become singular (it has diverged)."""
     m = inertia[_CYCLIC]
     adjugate = m[1:4, 1:4] * m[2:5, 2:5] - m[1:4, 2:5] * m[2:5, 1:4]
-    return (adjugate * right).sum(1) / (m[0, :3] * adjugate[0]).sum(0)
+    determinant = np.einsum("jn,jn->n", m[0, :3], adjugate[0])
+    return np.einsum("ijn,jn->in", adjugate, right) / determinant
 
 
 @dataclass
@@ -123,7 +124,7 @@ class MomentumKeeper:
         np.multiply(tree.velocity.T, self.mass, out=shown[3:6])
         jacobian = self._turning(tree.root_pos.T - shown[6:], tree.root_rot.T)
         # The generalised force of the root is a wrench at the centre of mass.
-        wrench = np.concatenate(((jacobian * force[:, None]).sum(0), force[:3]))
+        wrench = np.concatenate((np.einsum("ijn,in->jn", jacobian, force), force[:3]))
         wrench += self._weight
         touching = np.abs(force).sum(0) >= NO_FORCE
         if current:
@@ -137,7 +138,7 @@ class MomentumKeeper:
         twist, shift = error[:6], error[6:]
         twist[:3] = _solve(tree.inertia.T.copy(), twist[:3])
         twist[3:] /= self.mass
-        change = (jacobian * twist[:3]).sum(1)
+        change = np.einsum("ijn,jn->in", jacobian, twist[:3])
         change[:3] += twist[3:]
         return twist, change, shift
 

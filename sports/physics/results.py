@@ -173,7 +173,7 @@ class Display:
             objects.pos[:, k], objects.linvel[:, k] = pos, linear
             unit = np.divide(quat, np.sqrt((quat * quat).sum(0)), out=objects.quat[:, k])
             turn = rotation(unit, np.empty((3, 3, out.num_worlds), np.float32))
-            objects.angvel[:, k] = (turn * spin).sum(1)
+            np.einsum("ijn,jn->in", turn, spin, out=objects.angvel[:, k])
 
     def pose(self, agent: int) -> None:
         """The links of an athlete, as the shown state has them, with positions from the root."""

@@ -157,8 +157,7 @@ class _Peaks:
     def look(self) -> None:
         """Takes a substep into account."""
         force = self._sensors.astype(np.float32, order="C").reshape(-1, 3, self._out.num_worlds)
-        square = force * force
-        square = square[:, 0] + square[:, 1] + square[:, 2]
+        square = np.einsum("kin,kin->kn", force, force)
         if self._largest is None:
             self._largest = force, square
             return
