@@ -194,9 +194,7 @@ class Env:
         self.view.clock = self.view.clock.index_fill(0, worlds, 0)
         self.age = self.age.index_fill(0, worlds, 0)
         self.view.refresh()
-        self.memory = {
-            k: _with_rows(v, worlds, stock.memory[k]) for k, v in self.memory.items()
-        }
+        self.memory = {k: _with_rows(v, worlds, stock.memory[k]) for k, v in self.memory.items()}
         return _with_rows(obs, worlds, stock.obs)
 
     def _prepare(self, state: PhysicsState, context: Memory) -> Stock:

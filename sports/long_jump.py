@@ -118,9 +118,7 @@ def advance(view: View, memory: Memory) -> Advance:
     lands = (mode == FLIGHT) & any_contact
     mode = torch.where(takes_off, FLIGHT, torch.where(lands, LANDED, mode))
     landed = mode == LANDED
-    nearest = torch.minimum(
-        torch.where(above, torch.inf, points_x).amin((1, 2)), brief_x.amin(-1)
-    )
+    nearest = torch.minimum(torch.where(above, torch.inf, points_x).amin((1, 2)), brief_x.amin(-1))
     mark = torch.where(landed, torch.minimum(memory["mark"], nearest), memory["mark"])
     since_landing = memory["since_landing"] + (landed & ~lands)
     measured = landed & (since_landing >= MARK_STEPS)

@@ -20,6 +20,7 @@ from sports.physics.kinematics import Kinematics, Pose
 from sports.physics.vectors import rotation
 from sports.scene import Scene
 
+
 @dataclass(frozen=True)
 class Motion:
     """Of some bodies (...) in N worlds; m, m/s, rad/s, world frame."""
