@@ -3,8 +3,8 @@
 Gains act as ``stiffness = position servo limited to +-effort``, ``damping = passive joint
 damping``: a clamped damper inside the actuator stops damping and explodes (measured). Contact
 forces come from contact sensors (``netforce``): one per athlete link against the ground, then
-one per named pair of the scene; then each athlete's angular momentum about its centre of mass and
-the velocity of that centre. Three numbers each, world frame.
+one per named pair of the scene; then each athlete's ``WHOLE_SENSORS``. Three numbers each, world
+frame.
 """
 
 from __future__ import annotations
@@ -116,6 +116,13 @@ def _side(scene: Scene, name: str) -> tuple[mujoco.mjtObj, str]:
     return mujoco.mjtObj.mjOBJ_BODY, name
 
 
+WHOLE_SENSORS = (
+    *("SUBTREEANGMOM", "SUBTREELINVEL", "SUBTREECOM"),
+    *("FRAMEPOS", "FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS"),
+)
+"""Of each athlete's root, in a row, for its momentum keeper: kinds of sensors with 3 numbers."""
+
+
 def _add_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
     def add(name: str, a: tuple[mujoco.mjtObj, str], b: tuple[mujoco.mjtObj, str]) -> None:
         # MuJoCo reports the force on the second object: our first side, world frame.
@@ -138,11 +145,12 @@ def _add_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
         add(f"pair:{a}:{b}", _side(scene, a), _side(scene, b))
     for agent in range(scene.num_agents):
         root = body_name(agent, scene.body.links[0].name)
-        for kind in ("ANGMOM", "LINVEL"):
+        for kind in WHOLE_SENSORS:
+            frame = kind.startswith("FRAME")
             spec.add_sensor(
                 name=f"{kind.lower()}:{root}",
-                type=getattr(mujoco.mjtSensor, f"mjSENS_SUBTREE{kind}"),
-                objtype=mujoco.mjtObj.mjOBJ_BODY,
+                type=getattr(mujoco.mjtSensor, f"mjSENS_{kind}"),
+                objtype=mujoco.mjtObj.mjOBJ_XBODY if frame else mujoco.mjtObj.mjOBJ_BODY,
                 objname=root,
             )
 

@@ -23,6 +23,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from sports.humanoid.mjcf import WHOLE_SENSORS
+
 Bind = Callable[[str], np.ndarray]
 """Gives a live (N, ...) array of an MjData field by its name."""
 GRAVITY = np.array((0.0, 0.0, -9.81))
@@ -68,16 +70,9 @@ class Tree:
 
     inertia: np.ndarray
     """(N, 6) of the whole athlete about its centre of mass: xx, yy, zz, xy, xz, yz."""
-    angular: np.ndarray
-    """(N, 3) angular momentum about the centre of mass."""
-    velocity: np.ndarray
-    """(N, 3) of the centre of mass."""
-    com: np.ndarray
-    """(N, 3)"""
-    root_pos: np.ndarray
-    """(N, 3)"""
-    root_rot: np.ndarray
-    """(N, 9) R_WB by rows"""
+    motion: np.ndarray
+    """(N, 21) angular momentum about the centre of mass, its velocity, its position; position of
+    the root, x, y and z axes of the root."""
     root_force: np.ndarray
     """(N, 6) constraint force on the free joint: world force, moment in the root's frame."""
 
@@ -91,7 +86,6 @@ class MomentumKeeper:
         self.timestep = timestep
         # Components first, so that each operation runs over all worlds.
         self._expected = np.full((9, num_worlds), np.nan)
-        self._shown = np.empty((9, num_worlds))
         self._jacobian = np.zeros((2, 3, 3, num_worlds))
         self._weight = np.array((0.0, 0.0, 0.0, *(mass * GRAVITY)))[:, None]
 
@@ -119,10 +113,10 @@ class MomentumKeeper:
         Returns (6, N) spatial velocity (rotation, then velocity of the centre of mass; world),
         (6, N) the same as a change of the free joint's ``qvel``, (3, N) shift of the root.
         """
-        shown, force = self._shown, tree.root_force.T.copy()
-        shown[:3], shown[6:] = tree.angular.T, tree.com.T
-        np.multiply(tree.velocity.T, self.mass, out=shown[3:6])
-        jacobian = self._turning(tree.root_pos.T - shown[6:], tree.root_rot.T)
+        motion, force = tree.motion.T.copy(), tree.root_force.T.copy()
+        shown = motion[:9]
+        shown[3:6] *= self.mass
+        jacobian = self._turning(motion[9:12] - shown[6:], motion[12:])
         # The generalised force of the root is a wrench at the centre of mass.
         wrench = np.concatenate((np.einsum("ijn,in->jn", jacobian, force), force[:3]))
         wrench += self._weight
@@ -142,15 +136,15 @@ class MomentumKeeper:
         change[:3] += twist[3:]
         return twist, change, shift
 
-    def _turning(self, arm: np.ndarray, rot: np.ndarray) -> np.ndarray:
+    def _turning(self, arm: np.ndarray, axes: np.ndarray) -> np.ndarray:
         """(6, 3, N) Jacobian of the free joint's ``qvel`` by a rotation about the centre of mass,
-        which turns the root at ``arm`` (3, N) from there with attitude ``rot`` (9, N)."""
+        which turns the root at ``arm`` (3, N) from there with ``axes`` (9, N)."""
         cross, turn = self._jacobian
         x, y, z = arm
         cross[0, 1], cross[1, 2], cross[2, 0] = z, x, y
         np.negative(arm, out=arm)
         cross[1, 0], cross[2, 1], cross[0, 2] = z, x, y
-        turn[:] = rot.reshape(3, 3, -1).swapaxes(0, 1)
+        turn[:] = axes.reshape(3, 3, -1)
         return self._jacobian.reshape(6, 3, -1)
 
     def _advance(self, wrench: np.ndarray) -> None:
@@ -163,7 +157,7 @@ class MomentumKeeper:
 class AthleteKeeper:
     """Keeps the momentum of one athlete of N simulations of a plain MuJoCo model.
 
-    The model needs the athlete's two momentum sensors, as ``mjcf.build_spec`` adds them; its
+    The model needs the athlete's ``WHOLE_SENSORS``, as ``mjcf.build_spec`` adds them; its
     contact sensors may be deleted. Works on a batch and, with one row, on an ``MjData``::
 
         keeper = AthleteKeeper(model, batch.bind, "agent0/Pelvis")
@@ -189,24 +183,19 @@ class AthleteKeeper:
             num_worlds: keep the first so many simulations; None for all.
 
         Raises:
-            ValueError: the model lacks the athlete's momentum sensors.
+            ValueError: the model lacks a sensor of the athlete.
         """
         names = [model.sensor(i).name for i in range(model.nsensor)]
-        for name in (f"angmom:{root}", f"linvel:{root}"):
+        for name in (f"{kind.lower()}:{root}" for kind in WHOLE_SENSORS):
             if name not in names:
                 raise ValueError(f"the model has no sensor '{name}'; see sports.humanoid.mjcf")
         n, body = slice(num_worlds), model.body(root)
         q, v = model.jnt_qposadr[body.jntadr[0]], model.jnt_dofadr[body.jntadr[0]]
-        spin, speed = (model.sensor(f"{k}:{root}").adr[0] for k in ("angmom", "linvel"))
-        sensors = bind("sensordata")
+        first = model.sensor(f"{WHOLE_SENSORS[0].lower()}:{root}").adr[0]
         self._pos, self._vel = bind("qpos")[n, q : q + 3], bind("qvel")[n, v : v + 6]
         self.tree = Tree(
             inertia=bind("crb")[n, body.id, :6],
-            angular=sensors[n, spin : spin + 3],
-            velocity=sensors[n, speed : speed + 3],
-            com=bind("subtree_com")[n, body.id],
-            root_pos=bind("xpos")[n, body.id],
-            root_rot=bind("xmat")[n, body.id],
+            motion=bind("sensordata")[n, first : first + 3 * len(WHOLE_SENSORS)],
             root_force=bind("qfrc_constraint")[n, v : v + 6],
         )
         """What the fields show; live."""
@@ -221,8 +210,8 @@ class AthleteKeeper:
     def measured(self) -> np.ndarray:
         """(N, 9) as the fields show it: centre of mass (m), its velocity (m/s), angular momentum
         about it (N m s); world frame. The fields must be current, as after ``mj_forward``."""
-        tree = self.tree
-        return np.concatenate((tree.com, tree.velocity, tree.angular), axis=1)
+        angular, velocity, com = np.split(self.tree.motion[:, :9], 3, axis=1)
+        return np.concatenate((com, velocity, angular), axis=1)
 
     def whole(self) -> np.ndarray:
         """(N, 9) the same as :meth:`measured`, of the state as a ``current`` :meth:`correct` has

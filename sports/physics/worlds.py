@@ -124,15 +124,9 @@ class Worlds:
         root, pose = self.qpos[:, q : q + 3], self._display.poses[agent]
         self._display.pose(agent)
         whole = self._kinematics.whole(pose)
-        after = Tree(
-            inertia=whole.inertia.T,
-            angular=whole.angular.T,
-            velocity=whole.velocity.T,
-            com=root + whole.com.T,
-            root_pos=root,
-            root_rot=pose.rot[:, :, 0].reshape(9, -1).T,
-            root_force=keeper.tree.root_force,
-        )
+        axes = pose.rot[:, :, 0].swapaxes(0, 1).reshape(9, -1)
+        motion = (whole.angular, whole.velocity, root.T + whole.com, root.T, axes)
+        after = Tree(whole.inertia.T, np.concatenate(motion).T, keeper.tree.root_force)
         twist, _ = keeper.correct(True, after)
         # The pose is of the state before the correction, which moves the athlete as a whole.
         turn, speed = np.split(np.array(twist.T, np.float32, order="C"), 2)
