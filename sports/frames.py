@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sports import quaternion
 from sports.physics.base import Physics
 
 Array = Any
@@ -23,9 +22,9 @@ Array = Any
 class Heading:
     """Rotates world vectors into the heading frames of the athletes."""
 
-    def __init__(self, root_quat: Tensor) -> None:
-        """``root_quat`` (N, A, 4)."""
-        angle = quaternion.yaw(root_quat)
+    def __init__(self, root_rot: Tensor) -> None:
+        """``root_rot`` (N, A, 3, 3) R_WB."""
+        angle = torch.atan2(root_rot[..., 1, 0], root_rot[..., 0, 0])
         self.cos, self.sin = torch.cos(angle), torch.sin(angle)
 
     def local(self, v: Tensor) -> Tensor:
@@ -83,20 +82,21 @@ def proprioception(physics: Physics, heading: Heading, more: Sequence[Tensor] = 
     """
     n, agents, links = physics.body_pos.shape[:3]
     at = 15 * links - 2
-    size = at + sum(features.shape[-1] for features in more)
-    rows = physics.body_pos.new_empty(agents, size, n)
-    if physics.felt is not None:
-        rows[:, :at] = physics.felt.permute(1, 2, 0)
-    else:
+    obs = physics.body_pos.new_empty(n, agents, at + sum(f.shape[-1] for f in more))
+    felt = physics.felt
+    if felt is None:
         pos, linvel, angvel = (
             v.permute(1, 3, 2, 0)
             for v in (physics.body_pos, physics.body_linvel, physics.body_angvel)
         )
         rot = physics.body_rot.permute(1, 3, 4, 2, 0)
+        rows = physics.body_pos.new_empty(agents, at, n)
         for a in range(agents):
             cos, sin = heading.cos[:, a], heading.sin[:, a]
-            fill_proprioception(rows[a, :at], cos, sin, pos[a], rot[a], linvel[a], angvel[a])
+            fill_proprioception(rows[a], cos, sin, pos[a], rot[a], linvel[a], angvel[a])
+        felt = rows.permute(2, 0, 1)
+    obs[..., :at] = felt
     for features in more:
-        rows[:, at : at + features.shape[-1]] = features.permute(1, 2, 0)
+        obs[..., at : at + features.shape[-1]] = features
         at += features.shape[-1]
-    return rows.flatten(0, 1).T.contiguous().unflatten(1, (agents, -1))
+    return obs

@@ -207,8 +207,9 @@ def advance(view: View, memory: Memory) -> Advance:
 
     gained = (x - memory["x_max"]).clamp(min=0.0)
     over = (x > BAR_X - 0.5) & (x < BAR_X + 0.5)
+    approach = progress(before, root, goal)
     terms = {
-        "progress": clamp01(progress(before, root, goal)),
+        "progress": clamp01(approach),
         "height": z * gained / 0.1 * over,
     }
 
@@ -228,10 +229,10 @@ def advance(view: View, memory: Memory) -> Advance:
         | (view.physics.pair_force[:, 0] > MAX_PUSH)
     )
     outside = (root[:, 1] < -0.5) | (root[:, 1] > 8.0) | (x < -0.5)
-    approach = progress(before, root, goal) / view.control_timestep
-    slow = (approach < STALL_SPEED) & (x < CLEARED_X)
-    stalled = torch.where(slow, memory["stalled"] + 1, torch.zeros_like(memory["stalled"]))
-    fell = view.fallen()[:, 0] & (x < CLEARED_X)
+    short = x < CLEARED_X
+    slow = (approach < STALL_SPEED * view.control_timestep) & short
+    stalled = (memory["stalled"] + 1) * slow
+    fell = view.fallen()[:, 0] & short
 
     beyond = view.physics.body_pos[:, 0, :, 0] > CLEARED_X
     touch = (view.touching()[:, 0] & beyond).any(-1) & (x > CLEARED_X)
@@ -245,7 +246,7 @@ def advance(view: View, memory: Memory) -> Advance:
     height_count = memory["height_count"] + near
     crossing_z = torch.where(crosses, at[:, 2], memory["crossing_z"])
     # An arm that swings back over the bar's plane after the landing is not the jump.
-    low_now = torch.where(memory["landed"] > 0, torch.inf, _lowest_over_bar(view))
+    low_now = _lowest_over_bar(view).masked_fill(memory["landed"] > 0, torch.inf)
     lowest = torch.minimum(memory["lowest_over_bar"], low_now)
 
     mean_height = torch.where(height_count > 0, height_sum / height_count.clamp(min=1), crossing_z)
@@ -291,8 +292,8 @@ def _lowest_over_bar(view: View) -> Tensor:
         geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0], axis)
         for axis in (0, 2)
     )
-    over = (x - BAR_X).abs() < 0.05
-    return torch.where(over, z - geometry.link_radii, torch.inf).amin((1, 2))
+    aside = (x - BAR_X).abs() >= 0.05
+    return torch.where(aside, torch.inf, z - geometry.link_radii).amin((1, 2))
 
 
 TASK = Task(

@@ -20,6 +20,7 @@ from sports.humanoid.body import Body
 from sports.physics.base import PhysicsState
 from sports.scene import Scene
 from sports.task import Advance, Memory, Task, View, clamp01, constant, nan_where, progress
+from sports.task import length as magnitude
 
 LINE_X = 20.0
 START, LINE, GOAL = (0.0, 0.0, 0.0), (LINE_X, 0.0, 0.0), (30.0, 0.0, 1.0)
@@ -79,10 +80,9 @@ def begin(view: View, context: Memory) -> Memory:
 def features(view: View, memory: Memory) -> dict[str, Tensor]:
     """Start, line and goal as seen from the athlete (9)."""
     root = view.root_pos
-    return {
-        name: view.heading.local(constant(point, root.device) - root)
-        for name, point in (("start", START), ("line", LINE), ("goal", GOAL))
-    }
+    marks = constant((*START, *LINE, *GOAL), root.device).view(3, 3)
+    start, line, goal = view.heading.local(marks - root[:, :, None]).unbind(2)
+    return {"start": start, "line": line, "goal": goal}
 
 
 def advance(view: View, memory: Memory) -> Advance:
@@ -97,7 +97,7 @@ def advance(view: View, memory: Memory) -> Advance:
         for axis in (0, 2)
     )
     clearance = points_z - geometry.link_radii
-    on_ground = clearance < TOUCH  # now
+    above = clearance >= TOUCH  # now
     standing = geometry.least(clearance) < TOUCH  # (N, B)
     rear = _rear(view, points_x)
     # A link that touched within the step and is off again: all of it was at or beyond this x.
@@ -107,7 +107,7 @@ def advance(view: View, memory: Memory) -> Advance:
 
     mode = memory["mode"]
     running = mode == RUN
-    front = torch.where(on_ground, points_x, -torch.inf).amax((1, 2))
+    front = torch.where(above, -torch.inf, points_x).amax((1, 2))
     brief_front = torch.where(brief, brief_x, -torch.inf).amax(-1)
     foul = running & ((front >= LINE_X) | (brief_front >= LINE_X))
     fell = running & view.fallen()[:, 0]
@@ -118,9 +118,7 @@ def advance(view: View, memory: Memory) -> Advance:
     lands = (mode == FLIGHT) & any_contact
     mode = torch.where(takes_off, FLIGHT, torch.where(lands, LANDED, mode))
     landed = mode == LANDED
-    nearest = torch.minimum(
-        torch.where(on_ground, points_x, torch.inf).amin((1, 2)), brief_x.amin(-1)
-    )
+    nearest = torch.minimum(torch.where(above, torch.inf, points_x).amin((1, 2)), brief_x.amin(-1))
     mark = torch.where(landed, torch.minimum(memory["mark"], nearest), memory["mark"])
     since_landing = memory["since_landing"] + (landed & ~lands)
     measured = landed & (since_landing >= MARK_STEPS)
@@ -133,11 +131,11 @@ def advance(view: View, memory: Memory) -> Advance:
         "progress": clamp01(progress(memory["root"], root, goal)),
         "speed": 0.01 * view.root_linvel[:, 0, 0],
         "flight": 0.1 * root[:, 2] * flying,
-        "length": torch.where(success, 30.0 * length, 0.0),
+        "length": (30.0 * length).masked_fill(~success, 0.0),
     }
 
     com, com_velocity = geometry.center_of_mass(view.physics, 0)
-    takeoff_speed = torch.where(takes_off, com_velocity.norm(dim=-1), memory["takeoff_speed"])
+    takeoff_speed = torch.where(takes_off, magnitude(com_velocity), memory["takeoff_speed"])
     takeoff_com_z = torch.where(takes_off, com[:, 2], memory["takeoff_com_z"])
     landing_com_z = torch.where(lands, com[:, 2], memory["landing_com_z"])
     flight_steps = memory["flight_steps"] + flying

@@ -69,9 +69,3 @@ def matrix(q: Tensor) -> Tensor:
         1 - (xx + yy),
     )
     return stack(rows).unflatten(-1, (3, 3))
-
-
-def yaw(q: Tensor) -> Tensor:
-    """(...) heading: angle about +z of the body's x axis projected on the ground (rad)."""
-    w, x, y, z = q.unbind(-1)
-    return torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

@@ -50,7 +50,7 @@ class View:
     def heading(self) -> Heading:
         """The athletes' heading frames, computed once a step."""
         if self._heading is None:
-            self._heading = Heading(self.physics.body_quat[:, :, 0])
+            self._heading = Heading(self.physics.body_rot[:, :, 0])
         return self._heading
 
     @property
@@ -72,8 +72,7 @@ class View:
     def pressure(self) -> Tensor:
         """(N, A, B) squared force of the ground on each link (N^2), computed once a step."""
         if self._pressure is None:
-            force = self.physics.ground_force.permute(3, 1, 2, 0)  # by component
-            self._pressure = force.square().sum(0).permute(2, 0, 1)
+            self._pressure = squared(self.physics.ground_force)
         return self._pressure
 
     def touching(self) -> Tensor:
@@ -162,10 +161,15 @@ def progress(before: Tensor, now: Tensor, goal: Tensor) -> Tensor:
     return length(before - goal) - length(now - goal)
 
 
+def squared(v: Tensor) -> Tensor:
+    """(...) squared length of vectors (..., 3)."""
+    x, y, z = v.unbind(-1)
+    return torch.addcmul(x * x, y, y).addcmul_(z, z)
+
+
 def length(v: Tensor) -> Tensor:
     """(...) Euclidean length of vectors (..., 3); quicker than torch's norm on a CPU."""
-    x, y, z = v.unbind(-1)
-    return (x * x + y * y + z * z).sqrt()
+    return squared(v).sqrt_()
 
 
 def clamp01(x: Tensor) -> Tensor:
@@ -175,4 +179,4 @@ def clamp01(x: Tensor) -> Tensor:
 
 def nan_where(mask: Tensor, value: Tensor) -> Tensor:
     """``value`` with NaN where ``mask`` is true: an undefined metric."""
-    return torch.where(mask, torch.full_like(value, torch.nan), value)
+    return value.masked_fill(mask, torch.nan)

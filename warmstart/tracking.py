@@ -95,7 +95,7 @@ class _Worlds:
         root = body_name(0, scene.body.link_names[0])
         spec = build_spec(scene)
         for sensor in list(spec.sensors):  # nobody reads forces here, and they cost time
-            if not sensor.name.startswith(("angmom:", "linvel:")):
+            if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT:
                 spec.delete(sensor)
         self.scene, self.model, self._root = scene, spec.compile(), root
         self.batch = Batch(self.model, nsim=worlds, nthread=threads)

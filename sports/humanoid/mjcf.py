@@ -3,13 +3,13 @@
 Gains act as ``stiffness = position servo limited to +-effort``, ``damping = passive joint
 damping``: a clamped damper inside the actuator stops damping and explodes (measured). Contact
 forces come from contact sensors (``netforce``): one per athlete link against the ground, then
-one per named pair of the scene; then each athlete's angular momentum about its centre of mass and
-the velocity of that centre. Three numbers each, world frame.
+one per named pair of the scene; then each athlete's ``WHOLE_SENSORS``. Three numbers each, world
+frame.
 
-Contacts of athletes and ground are softer than MuJoCo's default against load (``CONTACT_SOLIMP``):
-with the default impedance of 0.9-0.95 a foot that has sunk in on impact is driven out again
-whatever it carries, so that the ground does work: 0.16 m/s forward and 0.20 m/s up at each stance
-of a sprint, more at a coarse time step. docs/physics.md has the measurements.
+Contacts of athletes and ground yield to load (``CONTACT_IMPEDANCE``). With MuJoCo's default of
+0.9-0.95 a foot that has sunk in on impact is driven out again whatever it carries, so the ground
+does work: 0.16 m/s forward and 0.18 m/s up in 0.13 s of a sprint, more at a coarse time step.
+docs/physics.md has the measurements.
 """
 
 from __future__ import annotations
@@ -130,6 +130,13 @@ def _side(scene: Scene, name: str) -> tuple[mujoco.mjtObj, str]:
     return mujoco.mjtObj.mjOBJ_BODY, name
 
 
+WHOLE_SENSORS = (
+    *("SUBTREEANGMOM", "SUBTREELINVEL", "SUBTREECOM"),
+    *("FRAMEPOS", "FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS"),
+)
+"""Of each athlete's root, in a row, for its momentum keeper: kinds of sensors with 3 numbers."""
+
+
 def _add_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
     def add(name: str, a: tuple[mujoco.mjtObj, str], b: tuple[mujoco.mjtObj, str]) -> None:
         # MuJoCo reports the force on the second object: our first side, world frame.
@@ -152,11 +159,12 @@ def _add_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
         add(f"pair:{a}:{b}", _side(scene, a), _side(scene, b))
     for agent in range(scene.num_agents):
         root = body_name(agent, scene.body.links[0].name)
-        for kind in ("ANGMOM", "LINVEL"):
+        for kind in WHOLE_SENSORS:
+            frame = kind.startswith("FRAME")
             spec.add_sensor(
                 name=f"{kind.lower()}:{root}",
-                type=getattr(mujoco.mjtSensor, f"mjSENS_SUBTREE{kind}"),
-                objtype=mujoco.mjtObj.mjOBJ_BODY,
+                type=getattr(mujoco.mjtSensor, f"mjSENS_{kind}"),
+                objtype=mujoco.mjtObj.mjOBJ_XBODY if frame else mujoco.mjtObj.mjOBJ_BODY,
                 objname=root,
             )
 

@@ -61,6 +61,8 @@ class Physics(Protocol):
     """(N, A, B, 3, 3) the same as matrices."""
     felt: Tensor | None
     """(N, A, 15 B - 2) proprioception of ``sports.frames``, where the engine knows a quick way."""
+    whole: Tensor | None
+    """(N, A, 6) centres of mass of the athletes (m) and their velocities (m/s), likewise."""
     body_linvel: Tensor
     """(N, A, B, 3) velocity of the link origins, world frame."""
     body_angvel: Tensor
@@ -199,6 +201,9 @@ class Geometry:
 
     def center_of_mass(self, physics: Physics, agent: int) -> tuple[Tensor, Tensor]:
         """(N, 3) centre of mass of an athlete (m) and (N, 3) its velocity (m/s), world frame."""
+        if physics.whole is not None:
+            whole = physics.whole[:, agent]
+            return whole[:, :3], whole[:, 3:]
         # Components first, worlds last.
         x, y, z = physics.body_rot[:, agent].permute(3, 2, 1, 0)  # columns, (3, B, N)
         cx, cy, cz = self.center.T[..., None]  # (B, 1)

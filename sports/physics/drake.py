@@ -72,6 +72,7 @@ class DrakePhysics:
 
     engine = "drake"
     felt = None
+    whole = None
 
     def __init__(
         self,

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from sports.physics.vectors import cross
+from sports.humanoid.mjcf import WHOLE_SENSORS
 
 Bind = Callable[[str], np.ndarray]
 """Gives a live (N, ...) array of an MjData field by its name."""
@@ -50,21 +50,18 @@ def spatial_momentum(cinert: np.ndarray, cvel: np.ndarray) -> np.ndarray:
     return np.stack([row.sum(-1) for row in rows], axis=-1)
 
 
-def _rotate(w: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """(3, N) vectors ``v`` rotated by the unit quaternions of scalar ``w`` and vector ``u``."""
-    t = 2.0 * cross(u, v)
-    return v + w * t + cross(u, t)
+# Rows of a symmetric matrix (xx, yy, zz, xy, xz, yz), two of them and two columns repeated: with
+# these its cofactors are products of shifted blocks.
+_CYCLIC = np.array(((0, 3, 4), (3, 1, 5), (4, 5, 2)))[np.ix_((0, 1, 2, 0, 1), (0, 1, 2, 0, 1))]
 
 
 def _solve(inertia: np.ndarray, right: np.ndarray) -> np.ndarray:
     """(3, N) solution of N symmetric systems (6, N: xx, yy, zz, xy, xz, yz) by Cramer's rule;
     NaN, never an error, for an athlete whose inertia has become singular (it has diverged)."""
-    xx, yy, zz, xy, xz, yz = inertia
-    x, y, z = right
-    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy  # the adjugate's rows
-    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    solution = np.stack((a * x + b * y + c * z, b * x + d * y + e * z, c * x + e * y + f * z))
-    return solution / (xx * a + xy * b + xz * c)
+    m = inertia[_CYCLIC]
+    adjugate = m[1:4, 1:4] * m[2:5, 2:5] - m[1:4, 2:5] * m[2:5, 1:4]
+    determinant = np.einsum("jn,jn->n", m[0, :3], adjugate[0])
+    return np.einsum("ijn,jn->in", adjugate, right) / determinant
 
 
 @dataclass
@@ -73,16 +70,9 @@ class Tree:
 
     inertia: np.ndarray
     """(N, 6) of the whole athlete about its centre of mass: xx, yy, zz, xy, xz, yz."""
-    angular: np.ndarray
-    """(N, 3) angular momentum about the centre of mass."""
-    velocity: np.ndarray
-    """(N, 3) of the centre of mass."""
-    com: np.ndarray
-    """(N, 3)"""
-    root_pos: np.ndarray
-    """(N, 3)"""
-    root_quat: np.ndarray
-    """(N, 4)"""
+    motion: np.ndarray
+    """(N, 21) angular momentum about the centre of mass, its velocity, its position; position of
+    the root, x, y and z axes of the root."""
     root_force: np.ndarray
     """(N, 6) constraint force on the free joint: world force, moment in the root's frame."""
 
@@ -95,24 +85,23 @@ class MomentumKeeper:
         self.mass = mass
         self.timestep = timestep
         # Components first, so that each operation runs over all worlds.
-        self._target = np.full((6, num_worlds), np.nan)
-        self._path = np.full((3, num_worlds), np.nan)
+        self._expected = np.full((9, num_worlds), np.nan)
+        self._jacobian = np.zeros((2, 3, 3, num_worlds))
         self._weight = np.array((0.0, 0.0, 0.0, *(mass * GRAVITY)))[:, None]
 
     @property
     def target(self) -> np.ndarray:
         """(N, 6) momentum expected of the state measured next; NaN where unknown. A view."""
-        return self._target.T
+        return self._expected[:6].T
 
     @property
     def path(self) -> np.ndarray:
         """(N, 3) where the centre of mass should be in that state; NaN where unknown. A view."""
-        return self._path.T
+        return self._expected[6:].T
 
     def forget(self, ids: np.ndarray | slice) -> None:
         """The next measurement of these worlds is taken as it is (after a reset)."""
-        self._target[:, ids] = np.nan
-        self._path[:, ids] = np.nan
+        self._expected[:, ids] = np.nan
 
     def correct(self, tree: Tree, current: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What to add to the root after a substep.
@@ -121,40 +110,54 @@ class MomentumKeeper:
         a plain step), so the correction comes one substep late. True: they describe the state
         after it (but for ``root_force``, which is always of the substep).
 
-        Returns (N, 6) spatial velocity (rotation, then velocity of the centre of mass; world),
-        (N, 6) the same as a change of the free joint's ``qvel``, (N, 3) shift of the root.
+        Returns (6, N) spatial velocity (rotation, then velocity of the centre of mass; world),
+        (6, N) the same as a change of the free joint's ``qvel``, (3, N) shift of the root.
         """
-        h = self.timestep
-        com, quat = np.ascontiguousarray(tree.com.T), np.ascontiguousarray(tree.root_quat.T)
-        wrench = np.ascontiguousarray(tree.root_force.T)
-        w, u = quat[0], quat[1:]
-        arm = tree.root_pos.T - com
-        momentum = np.concatenate((tree.angular.T, self.mass * tree.velocity.T))
-        flying = np.abs(wrench).sum(0) < NO_FORCE
-        force = wrench[:3]
-        moment = _rotate(w, u, wrench[3:]) + cross(arm, force)
-        impulse = h * (np.concatenate((moment, force)) + self._weight)
+        motion, force = tree.motion.T.copy(), tree.root_force.T.copy()
+        shown = motion[:9]
+        shown[3:6] *= self.mass
+        jacobian = self._turning(motion[9:12] - shown[6:], motion[12:])
+        # The generalised force of the root is a wrench at the centre of mass.
+        wrench = np.concatenate((np.einsum("ijn,in->jn", jacobian, force), force[:3]))
+        wrench += self._weight
+        touching = np.abs(force).sum(0) >= NO_FORCE
+        if current:
+            self._advance(wrench)
+        error = self._expected - shown
+        np.copyto(error, 0.0, where=np.isnan(error))
+        np.copyto(error[6:], 0.0, where=touching)  # there the contacts decide
+        np.add(shown, error, out=self._expected)
+        if not current:
+            self._advance(wrench)
+        twist, shift = error[:6], error[6:]
+        twist[:3] = _solve(tree.inertia.T.copy(), twist[:3])
+        twist[3:] /= self.mass
+        change = np.einsum("ijn,jn->in", jacobian, twist[:3])
+        change[:3] += twist[3:]
+        return twist, change, shift
 
-        expected = self._target + impulse if current else self._target
-        np.copyto(expected, momentum, where=np.isnan(expected))
-        error = expected - momentum
-        spin = _solve(np.ascontiguousarray(tree.inertia.T), error[:3])
-        speed = error[3:] / self.mass
-        self._target = expected if current else expected + impulse
+    def _turning(self, arm: np.ndarray, axes: np.ndarray) -> np.ndarray:
+        """(6, 3, N) Jacobian of the free joint's ``qvel`` by a rotation about the centre of mass,
+        which turns the root at ``arm`` (3, N) from there with ``axes`` (9, N)."""
+        cross, turn = self._jacobian
+        x, y, z = arm
+        cross[0, 1], cross[1, 2], cross[2, 0] = z, x, y
+        np.negative(arm, out=arm)
+        cross[1, 0], cross[2, 1], cross[0, 2] = z, x, y
+        turn[:] = axes.reshape(3, 3, -1)
+        return self._jacobian.reshape(6, 3, -1)
 
-        # Position: the path of the momentum while nothing is touched.
-        here = self._path + h * (expected[3:] / self.mass) if current else self._path
-        shift = np.where(flying & np.isfinite(here), here - com, 0.0)
-        ahead = com + shift
-        self._path = ahead if current else ahead + h * (self._target[3:] / self.mass)
-        change = np.concatenate((speed + cross(spin, arm), _rotate(w, -u, spin)))
-        return np.concatenate((spin, speed)).T, change.T, shift.T
+    def _advance(self, wrench: np.ndarray) -> None:
+        """Lets the expected momentum and path go on by a time step."""
+        momentum, path = self._expected[:6], self._expected[6:]
+        momentum += self.timestep * wrench
+        path += self.timestep / self.mass * momentum[3:]
 
 
 class AthleteKeeper:
     """Keeps the momentum of one athlete of N simulations of a plain MuJoCo model.
 
-    The model needs the athlete's two momentum sensors, as ``mjcf.build_spec`` adds them; its
+    The model needs the athlete's ``WHOLE_SENSORS``, as ``mjcf.build_spec`` adds them; its
     contact sensors may be deleted. Works on a batch and, with one row, on an ``MjData``::
 
         keeper = AthleteKeeper(model, batch.bind, "agent0/Pelvis")
@@ -180,24 +183,19 @@ class AthleteKeeper:
             num_worlds: keep the first so many simulations; None for all.
 
         Raises:
-            ValueError: the model lacks the athlete's momentum sensors.
+            ValueError: the model lacks a sensor of the athlete.
         """
         names = [model.sensor(i).name for i in range(model.nsensor)]
-        for name in (f"angmom:{root}", f"linvel:{root}"):
+        for name in (f"{kind.lower()}:{root}" for kind in WHOLE_SENSORS):
             if name not in names:
                 raise ValueError(f"the model has no sensor '{name}'; see sports.humanoid.mjcf")
         n, body = slice(num_worlds), model.body(root)
         q, v = model.jnt_qposadr[body.jntadr[0]], model.jnt_dofadr[body.jntadr[0]]
-        spin, speed = (model.sensor(f"{k}:{root}").adr[0] for k in ("angmom", "linvel"))
-        sensors = bind("sensordata")
+        first = model.sensor(f"{WHOLE_SENSORS[0].lower()}:{root}").adr[0]
         self._pos, self._vel = bind("qpos")[n, q : q + 3], bind("qvel")[n, v : v + 6]
         self.tree = Tree(
             inertia=bind("crb")[n, body.id, :6],
-            angular=sensors[n, spin : spin + 3],
-            velocity=sensors[n, speed : speed + 3],
-            com=bind("subtree_com")[n, body.id],
-            root_pos=bind("xpos")[n, body.id],
-            root_quat=bind("xquat")[n, body.id],
+            motion=bind("sensordata")[n, first : first + 3 * len(WHOLE_SENSORS)],
             root_force=bind("qfrc_constraint")[n, v : v + 6],
         )
         """What the fields show; live."""
@@ -212,8 +210,8 @@ class AthleteKeeper:
     def measured(self) -> np.ndarray:
         """(N, 9) as the fields show it: centre of mass (m), its velocity (m/s), angular momentum
         about it (N m s); world frame. The fields must be current, as after ``mj_forward``."""
-        tree = self.tree
-        return np.concatenate((tree.com, tree.velocity, tree.angular), axis=1)
+        angular, velocity, com = np.split(self.tree.motion[:, :9], 3, axis=1)
+        return np.concatenate((com, velocity, angular), axis=1)
 
     def whole(self) -> np.ndarray:
         """(N, 9) the same as :meth:`measured`, of the state as a ``current`` :meth:`correct` has
@@ -234,9 +232,9 @@ class AthleteKeeper:
         tree = after or self.tree
         with np.errstate(all="ignore"):  # a simulation may have diverged
             twist, change, shift = self.expected.correct(tree, current)
-            self._vel += change
-            self._pos += shift
-        return twist, shift
+            self._vel += change.T
+            self._pos += shift.T
+        return twist.T, shift.T
 
 
 def rows_of(data: mujoco.MjData) -> Bind:

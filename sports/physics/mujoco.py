@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sports.humanoid.mjcf import build_model
-from sports.physics.base import Geometry, PhysicsState, default_state, diverged
+from sports.physics.base import Geometry, PhysicsState, default_state
 from sports.physics.kinematics import Kinematics
 from sports.physics.results import Display, Results, Shown
 from sports.physics.variation import Variation, draw
@@ -41,8 +41,7 @@ class MujocoPhysics:
         drawn = None
         if variation is not None:
             drawn = draw(variation, n, scene.substeps, variation_seed)
-        self._out = out = Results.zeros(scene, n)
-        self._display = Display(scene, kinematics, out)
+        self._out = out = Results(scene, n)
         self._worlds = Worlds(scene, model, kinematics, threads, out, drawn)
         shown = Shown(scene, self.geometry, out)
         self.qpos, self.qvel, self.mocap_pos = shown.qpos, shown.qvel, shown.mocap_pos
@@ -51,11 +50,8 @@ class MujocoPhysics:
             shown.body_quat,
             shown.body_rot,
         )
-        self.body_linvel, self.body_angvel, self.felt = (
-            shown.body_linvel,
-            shown.body_angvel,
-            shown.felt,
-        )
+        self.body_linvel, self.body_angvel = shown.body_linvel, shown.body_angvel
+        self.felt, self.whole = shown.felt, shown.whole
         self.object_pos, self.object_quat = shown.object_pos, shown.object_quat
         self.object_linvel, self.object_angvel = shown.object_linvel, shown.object_angvel
         self.ground_force, self.pair_force = shown.ground_force, shown.pair_force
@@ -65,7 +61,7 @@ class MujocoPhysics:
 
     def step(self, ctrl: Tensor) -> None:
         self._worlds.step(ctrl.numpy())
-        self.bad = diverged(self.qpos, self.qvel)
+        self.bad = torch.from_numpy(self._out.diverged())
         if self.bad.any():
             self.nan_worlds += int(self.bad.sum())
             safe = default_state(self.scene, self.num_worlds, self.device)
@@ -77,23 +73,26 @@ class MujocoPhysics:
         if ids.size:
             rows = [x.numpy()[ids] for x in (state.qpos, state.qvel, state.mocap_pos)]
             self._worlds.put(ids, *rows)
-            self._display.state(ids, *rows)
-            self._out.ground_force[..., ids] = 0.0
-            self._out.pair_force[..., ids] = 0.0
+            self._out.put(ids, self._results(*rows).by_world)
 
     def prepare(self, state: PhysicsState) -> Shown:
         """What every world would show after a reset to its row of ``state``, for ``restart``:
         for all together this costs little more than for a few."""
-        out = Results.zeros(self.scene, self.num_worlds)
         arrays = (x.numpy() for x in (state.qpos, state.qvel, state.mocap_pos))
-        Display(self.scene, self._kinematics, out).state(slice(None), *arrays)
-        return Shown(self.scene, self.geometry, out)
+        return Shown(self.scene, self.geometry, self._results(*arrays))
 
     def restart(self, worlds: Tensor, prepared: Shown) -> None:
         """Resets worlds (n,), by index, to what was prepared."""
         ids, out = worlds.numpy(), prepared.results
-        self._worlds.put(ids, out.qpos[ids], out.qvel[ids], out.mocap_pos[ids])
-        self._out.take(ids, out)
+        rows = out.by_world[ids]
+        self._worlds.put(ids, *out.states(rows))
+        self._out.put(ids, rows)
+
+    def _results(self, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> Results:
+        """Of states (n, nq), (n, nv), (n, M, 3) without contacts."""
+        out = Results(self.scene, len(qpos))
+        Display(self.scene, self._kinematics, out).state(qpos, qvel, mocap)
+        return out
 
     def extent(self, direction: Tensor) -> Tensor:
         return self.geometry.extent(self.body_pos, self.body_quat, direction)

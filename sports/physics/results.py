@@ -6,20 +6,19 @@ runs over all links and worlds at once.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sports.frames import fill_proprioception
-from sports.physics.base import Geometry
+from sports.physics.base import SPEED_LIMIT, Geometry
 from sports.physics.kinematics import Kinematics, Pose
 from sports.physics.vectors import rotation
 from sports.scene import Scene
-
-Rows = slice | np.ndarray
-"""Some worlds: all, or by index."""
 
 
 @dataclass(frozen=True)
@@ -35,61 +34,86 @@ class Motion:
     angvel: np.ndarray
     """(3, ..., N)"""
 
-    @classmethod
-    def zeros(cls, *shape: int) -> Motion:
-        """For bodies and worlds of ``shape`` (..., N)."""
-        return cls(*(np.zeros((k, *shape), np.float32) for k in (3, 4, 3, 3)))
 
-
-@dataclass(frozen=True)
 class Results:
-    """The tensors of ``Physics`` for N worlds."""
+    """The tensors of ``Physics`` for N worlds: parts of one array, so that worlds are copied at
+    once."""
 
-    qpos: np.ndarray
-    """(N, nq)"""
-    qvel: np.ndarray
-    """(N, nv)"""
-    mocap_pos: np.ndarray
-    """(N, M, 3)"""
-    links: Motion
-    """(A, B, N)"""
-    rotation: np.ndarray
-    """(3, 3, A, B, N) R_WB of the links."""
-    objects: Motion
-    """(O, N)"""
-    felt: np.ndarray
-    """(A, 15 B - 2, N) as ``Physics.felt``"""
-    ground_force: np.ndarray
-    """(3, A B, N) as ``Physics.ground_force``"""
-    pair_force: np.ndarray
-    """(P, N) as ``Physics.pair_force``"""
+    def __init__(self, scene: Scene, num_worlds: int) -> None:
+        agents, links, objects = scene.num_agents, scene.body.num_links, len(scene.free_objects)
+        shapes = {
+            "qpos": (scene.nq,),
+            "qvel": (scene.nv,),
+            "mocap_pos": (len(scene.mocap_objects), 3),
+            "rotation": (3, 3, agents, links),
+            "felt": (agents, 15 * links - 2),
+            "whole": (6, agents),
+            "ground_force": (3, agents * links),
+            "pair_force": (len(scene.contact_pairs),),
+        }
+        for kind, number in (("links", (agents, links)), ("objects", (objects,))):
+            shapes |= {f"{kind}.{f.name}": (_SIZES[f.name], *number) for f in fields(Motion)}
+        ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
+        self.num_worlds = num_worlds
+        # Rows a power of two apart would share their places in a cache.
+        self._all = np.zeros((ends[-1], num_worlds + 16), np.float32)[:, :num_worlds]
+        parts = {
+            name: rows.reshape(*shape, num_worlds)
+            for (name, shape), rows in zip(shapes.items(), np.split(self._all, ends[:-1]))
+        }
+        self.qpos = parts["qpos"]
+        """(nq, N)"""
+        self.qvel = parts["qvel"]
+        """(nv, N)"""
+        self.mocap_pos = parts["mocap_pos"]
+        """(M, 3, N)"""
+        self.links = _motion(parts, "links")
+        """(A, B, N)"""
+        self.rotation = parts["rotation"]
+        """(3, 3, A, B, N) R_WB of the links."""
+        self.objects = _motion(parts, "objects")
+        """(O, N)"""
+        self.felt = parts["felt"]
+        """(A, 15 B - 2, N) as ``Physics.felt``"""
+        self.whole = parts["whole"]
+        """(6, A, N) as ``Physics.whole``"""
+        self.ground_force = parts["ground_force"]
+        """(3, A B, N) as ``Physics.ground_force``"""
+        self.pair_force = parts["pair_force"]
+        """(P, N) as ``Physics.pair_force``"""
 
-    @classmethod
-    def zeros(cls, scene: Scene, n: int) -> Results:
-        """For ``n`` worlds of a scene."""
-        agents, links = scene.num_agents, scene.body.num_links
-        return cls(
-            qpos=np.zeros((n, scene.nq), np.float32),
-            qvel=np.zeros((n, scene.nv), np.float32),
-            mocap_pos=np.zeros((n, len(scene.mocap_objects), 3), np.float32),
-            links=Motion.zeros(agents, links, n),
-            rotation=np.zeros((3, 3, agents, links, n), np.float32),
-            felt=np.zeros((agents, 15 * links - 2, n), np.float32),
-            objects=Motion.zeros(len(scene.free_objects), n),
-            ground_force=np.zeros((3, agents * links, n), np.float32),
-            pair_force=np.zeros((len(scene.contact_pairs), n), np.float32),
-        )
+    @cached_property
+    def by_world(self) -> np.ndarray:
+        """(N, ...) a copy with the worlds first, quick to pick a few from."""
+        return np.ascontiguousarray(self._all.T)
 
-    def take(self, worlds: np.ndarray, other: Results) -> None:
-        """Copies the rows of some worlds, by index."""
-        for mine, theirs in zip(self._worlds_last(), other._worlds_last()):
-            mine[..., worlds] = theirs[..., worlds]
+    def states(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """qpos (n, nq), qvel (n, nv) and mocap_pos (n, M, 3) in rows of ``by_world``."""
+        nq, nv, moved = len(self.qpos), len(self.qvel), self.mocap_pos.size // self.num_worlds
+        qpos, qvel, mocap, _ = np.split(rows, np.cumsum((nq, nv, moved)), axis=1)
+        return qpos, qvel, mocap.reshape(len(rows), moved // 3, 3)
 
-    def _worlds_last(self) -> list[np.ndarray]:
-        """Views of all arrays with the worlds in the last axis."""
-        state = [self.qpos.T, self.qvel.T, self.mocap_pos.T]
-        motion = [getattr(m, f.name) for m in (self.links, self.objects) for f in fields(m)]
-        return [*state, *motion, self.rotation, self.felt, self.ground_force, self.pair_force]
+    def put(self, worlds: np.ndarray, rows: np.ndarray) -> None:
+        """Makes worlds, by index, those of some rows of ``by_world``."""
+        self._all[:, worlds] = rows.T
+
+    def diverged(self) -> np.ndarray:
+        """(N,) bool, as ``sports.physics.base.diverged``."""
+        furthest, fastest = np.abs(self.qpos).max(0), np.abs(self.qvel).max(0)
+        return ~((furthest < np.inf) & (fastest < SPEED_LIMIT))
+
+    def pose(self, agent: int) -> Pose:
+        """Of the athlete; views."""
+        links, rot = self.links, self.rotation[:, :, agent]
+        parts = (v[:, agent] for v in (links.pos, links.angvel, links.linvel))
+        return Pose(links.quat[:, agent], rot, *parts)
+
+
+_SIZES = {"pos": 3, "quat": 4, "linvel": 3, "angvel": 3}
+
+
+def _motion(parts: dict[str, np.ndarray], kind: str) -> Motion:
+    return Motion(*(parts[f"{kind}.{f.name}"] for f in fields(Motion)))
 
 
 class Shown:
@@ -97,14 +121,15 @@ class Shown:
 
     def __init__(self, scene: Scene, geometry: Geometry, results: Results) -> None:
         self.scene, self.geometry, self.results = scene, geometry, results
-        self.num_worlds = len(results.qpos)
-        self.qpos, self.qvel = torch.from_numpy(results.qpos), torch.from_numpy(results.qvel)
-        self.mocap_pos = torch.from_numpy(results.mocap_pos)
+        self.num_worlds = results.num_worlds
+        self.qpos, self.qvel = _turned(results.qpos), _turned(results.qvel)
+        self.mocap_pos = torch.from_numpy(results.mocap_pos).permute(2, 0, 1)
         links, objects = results.links, results.objects
         self.body_pos, self.body_quat = _turned(links.pos), _turned(links.quat)
         self.body_linvel, self.body_angvel = _turned(links.linvel), _turned(links.angvel)
         self.body_rot = torch.from_numpy(results.rotation).permute(4, 2, 3, 0, 1)
         self.felt = torch.from_numpy(results.felt).permute(2, 0, 1)
+        self.whole = _turned(results.whole)
         self.object_pos, self.object_quat = _turned(objects.pos), _turned(objects.quat)
         self.object_linvel, self.object_angvel = _turned(objects.linvel), _turned(objects.angvel)
         agents = (scene.num_agents, scene.body.num_links)
@@ -117,7 +142,8 @@ class Shown:
 
 def _turned(array: np.ndarray) -> Tensor:
     """(N, ..., k) tensor over an array (k, ..., N)."""
-    return torch.from_numpy(array).movedim((-1, 0), (0, -1))
+    turned = torch.from_numpy(array).movedim(-1, 0)
+    return turned.movedim(1, -1)
 
 
 class Display:
@@ -125,40 +151,40 @@ class Display:
 
     def __init__(self, scene: Scene, kinematics: Kinematics, out: Results) -> None:
         self._scene, self._kinematics, self._out = scene, kinematics, out
+        self.poses = [out.pose(agent) for agent in range(scene.num_agents)]
 
-    def state(self, rows: Rows, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
+    def state(self, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
         """Everything but forces, of states (n, nq), (n, nv), (n, M, 3)."""
         with np.errstate(all="ignore"):
-            for agent in range(self._scene.num_agents):
-                own = qpos[:, self._scene.agent_qpos(agent)]
-                pose = self._kinematics.pose(own, qvel[:, self._scene.agent_qvel(agent)])
-                self.athlete(agent, rows, own[:, :3], pose)
-            self.rest(rows, qpos, qvel, mocap)
+            self.given(qpos, qvel, mocap)
+            for agent, pose in enumerate(self.poses):
+                self.pose(agent)
+                root = qpos[:, self._scene.agent_qpos(agent)][:, :3].T
+                whole = self._kinematics.whole(pose)
+                self._out.whole[:, agent] = np.concatenate((root + whole.com, whole.velocity))
+                self.athlete(agent, root)
 
-    def athlete(self, agent: int, rows: Rows, root: np.ndarray, pose: Pose) -> None:
-        """The links of an athlete with its root at (n, 3)."""
-        out, links, order = self._out, self._out.links, self._kinematics.table
-        pos = (pose.pos[:, order] + root.T[:, None]).astype(np.float32)
-        rot, linvel, angvel = pose.rot[:, :, order], pose.velocity[:, order], pose.spin[:, order]
-        links.pos[:, agent][..., rows] = pos
-        links.quat[:, agent][..., rows] = pose.quat[:, order]
-        links.linvel[:, agent][..., rows] = linvel
-        links.angvel[:, agent][..., rows] = angvel
-        out.rotation[:, :, agent][..., rows] = rot
-        felt = np.empty((out.felt.shape[1], pos.shape[2]), np.float32)
-        yaw = np.arctan2(rot[1, 0, 0], rot[0, 0, 0])
-        fill_proprioception(felt, np.cos(yaw), np.sin(yaw), pos, rot, linvel, angvel)
-        out.felt[agent][:, rows] = felt
-
-    def rest(self, rows: Rows, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
+    def given(self, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
         """The state itself, and the objects."""
-        out, objects = self._out, self._out.objects
-        out.qpos[rows], out.qvel[rows], out.mocap_pos[rows] = qpos, qvel, mocap
-        for k, o in enumerate(self._scene.free_objects):
-            pos, quat = np.split(qpos[:, self._scene.object_qpos(o.name)].T, [3])
-            linear, (x, y, z) = np.split(qvel[:, self._scene.object_qvel(o.name)].T, 2)
-            quat = quat / np.sqrt((quat * quat).sum(0))
-            turn = rotation(quat)
-            objects.pos[:, k][:, rows], objects.quat[:, k][:, rows] = pos, quat
-            objects.linvel[:, k][:, rows] = linear
-            objects.angvel[:, k][:, rows] = turn[:, 0] * x + turn[:, 1] * y + turn[:, 2] * z
+        out, objects, scene = self._out, self._out.objects, self._scene
+        out.qpos[:], out.qvel[:], out.mocap_pos[:] = qpos.T, qvel.T, mocap.transpose(1, 2, 0)
+        for k, o in enumerate(scene.free_objects):
+            pos, quat = np.split(out.qpos[scene.object_qpos(o.name)], [3])
+            linear, spin = np.split(out.qvel[scene.object_qvel(o.name)], 2)
+            objects.pos[:, k], objects.linvel[:, k] = pos, linear
+            unit = np.divide(quat, np.sqrt((quat * quat).sum(0)), out=objects.quat[:, k])
+            turn = rotation(unit, np.empty((3, 3, out.num_worlds), np.float32))
+            np.einsum("ijn,jn->in", turn, spin, out=objects.angvel[:, k])
+
+    def pose(self, agent: int) -> None:
+        """The links of an athlete, as the shown state has them, with positions from the root."""
+        qpos, qvel = self._scene.agent_qpos(agent), self._scene.agent_qvel(agent)
+        self._kinematics.pose(self._out.qpos[qpos], self._out.qvel[qvel], self.poses[agent])
+
+    def athlete(self, agent: int, root: np.ndarray) -> None:
+        """Puts the links of an athlete to its root (3, n), and what it feels."""
+        pose = self.poses[agent]
+        pose.pos[:] += root.astype(np.float32)[:, None]
+        yaw = np.arctan2(pose.rot[1, 0, 0], pose.rot[0, 0, 0])
+        motion = (pose.pos, pose.rot, pose.velocity, pose.spin)
+        fill_proprioception(self._out.felt[agent], np.cos(yaw), np.sin(yaw), *motion)

@@ -15,15 +15,20 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return out
 
 
-def rotation(quat: np.ndarray) -> np.ndarray:
-    """(3, 3, ...) matrices of unit quaternions (4, ...)."""
-    w, x, y, z = quat
-    x2, y2, z2 = x + x, y + y, z + z
-    xx, yy, zz = x * x2, y * y2, z * z2
-    xy, xz, yz = x * y2, x * z2, y * z2
-    wx, wy, wz = w * x2, w * y2, w * z2
-    out = np.empty((3, 3, *quat.shape[1:]), quat.dtype)
-    out[0, 0], out[0, 1], out[0, 2] = 1 - (yy + zz), xy - wz, xz + wy
-    out[1, 0], out[1, 1], out[1, 2] = xy + wz, 1 - (xx + zz), yz - wx
-    out[2, 0], out[2, 1], out[2, 2] = xz - wy, yz + wx, 1 - (xx + yy)
+def rotation(quat: np.ndarray, out: np.ndarray) -> np.ndarray:
+    """Writes the (3, 3, ...) matrices of unit quaternions (4, ...) to ``out`` and returns it."""
+    w, vector = quat[0], quat[1:]
+    twice = vector + vector
+    xx, yy, zz = vector * twice
+    wx, wy, wz = w * twice
+    xy, yz, zx = vector * twice[[1, 2, 0]]
+    np.subtract(1, yy + zz, out=out[0, 0])
+    np.subtract(1, xx + zz, out=out[1, 1])
+    np.subtract(1, xx + yy, out=out[2, 2])
+    np.subtract(xy, wz, out=out[0, 1])
+    np.add(xy, wz, out=out[1, 0])
+    np.add(zx, wy, out=out[0, 2])
+    np.subtract(zx, wy, out=out[2, 0])
+    np.subtract(yz, wx, out=out[1, 2])
+    np.add(yz, wx, out=out[2, 1])
     return out

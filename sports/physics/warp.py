@@ -209,6 +209,7 @@ class WarpPhysics:
 
     engine = "warp"
     felt = None
+    whole = None
 
     def __init__(
         self,

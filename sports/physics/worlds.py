@@ -31,9 +31,9 @@ class Worlds:
         drawn: Draw | None = None,
     ) -> None:
         """``model`` of ``mjcf``; ``drawn``: what makes the worlds differ."""
-        self.scene, self._kinematics = scene, kinematics
+        self.scene, self._kinematics, self._out = scene, kinematics, out
         self._display = Display(scene, kinematics, out)
-        n, body = len(out.qpos), scene.body
+        n, body = out.num_worlds, scene.body
         self.batch = batch = Batch(model, nsim=n, nthread=threads)
         self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
         self.warmstart, self._ctrl = batch.bind("qacc_warmstart"), batch.bind("ctrl")
@@ -55,7 +55,6 @@ class Worlds:
     def step(self, ctrl: np.ndarray) -> None:
         """One control step with targets (n, nu)."""
         self._ctrl[:] = ctrl
-        self._peaks.clear()
         for i in range(self.scene.substeps):
             if self._timesteps is not None:
                 self._timestep[:] = self._timesteps[i].reshape(self._timestep.shape)
@@ -68,9 +67,9 @@ class Worlds:
                     for keeper in self.keepers:
                         keeper.correct(current=False)
         with np.errstate(all="ignore"):
+            self._display.given(self.qpos, self.qvel, self._mocap_pos())
             for agent, keeper in enumerate(self.keepers):
                 self._finish(agent, keeper)
-            self._display.rest(slice(None), self.qpos, self.qvel, self._mocap_pos())
         self._peaks.show()
 
     def put(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
@@ -84,7 +83,7 @@ class Worlds:
 
     def show(self) -> None:
         """Shows a state that was set from outside."""
-        self._display.state(slice(None), self.qpos, self.qvel, self._mocap_pos())
+        self._display.state(self.qpos, self.qvel, self._mocap_pos())
 
     def load(
         self,
@@ -121,25 +120,23 @@ class Worlds:
             self._timesteps = [none if i % 2 else double for i in range(self.scene.substeps)]
 
     def _finish(self, agent: int, keeper: AthleteKeeper) -> None:
-        """Corrects an athlete's momentum after the last substep and shows its links."""
-        qpos = self.qpos[:, self.scene.agent_qpos(agent)]
-        pose = self._kinematics.pose(qpos, self.qvel[:, self.scene.agent_qvel(agent)])
+        """Corrects an athlete's momentum after the last substep and shows it."""
+        q, v = self.scene.agent_qpos(agent).start, self.scene.agent_qvel(agent).start
+        root, pose = self.qpos[:, q : q + 3], self._display.poses[agent]
+        self._display.pose(agent)
         whole = self._kinematics.whole(pose)
-        after = Tree(
-            inertia=whole.inertia.T,
-            angular=whole.angular.T,
-            velocity=whole.velocity.T,
-            com=qpos[:, :3] + whole.com.T,
-            root_pos=qpos[:, :3],
-            root_quat=qpos[:, 3:7],
-            root_force=keeper.tree.root_force,
-        )
+        axes = pose.rot[:, :, 0].swapaxes(0, 1).reshape(9, -1)
+        motion = (whole.angular, whole.velocity, root.T + whole.com, root.T, axes)
+        after = Tree(whole.inertia.T, np.concatenate(motion).T, keeper.tree.root_force)
         twist, _ = keeper.correct(True, after)
-        # The pose is of the velocities before the correction, which moves the athlete as a whole.
+        # The pose is of the state before the correction, which moves the athlete as a whole.
         turn, speed = np.split(np.array(twist.T, np.float32, order="C"), 2)
         pose.spin[:] += turn[:, None]
         pose.velocity[:] += speed[:, None] + cross(turn[:, None], pose.pos - whole.com[:, None])
-        self._display.athlete(agent, slice(None), qpos[:, :3], pose)
+        self._display.athlete(agent, root.T)
+        out = self._out
+        out.qpos[q : q + 3], out.qvel[v : v + 6] = root.T, self.qvel[:, v : v + 6].T
+        out.whole[:, agent] = keeper.whole()[:, :6].T
 
 
 class _Peaks:
@@ -147,29 +144,30 @@ class _Peaks:
 
     def __init__(self, sensors: np.ndarray, out: Results) -> None:
         """``sensors`` (n, 3 k), live: first those of the ground, then those of the pairs."""
-        self._sensors, self._out = sensors, out
         ground, pairs = out.ground_force.shape[1], len(out.pair_force)
-        self._split = (ground, ground + pairs)
-        self._force = np.zeros((len(sensors), sensors.shape[1] // 3, 3))
-        self._square = np.zeros(self._force.shape[:2])
-
-    def clear(self) -> None:
-        """Before the first substep."""
-        self._force[:] = 0.0
-        self._square[:] = 0.0
-        self._square[:, self._split[1] :] = np.inf  # the other sensors are no forces
+        self._ground, self._out = ground, out
+        self._sensors = sensors[:, : 3 * (ground + pairs)].T
+        self._largest: tuple[np.ndarray, np.ndarray] | None = None
 
     def look(self) -> None:
-        """Takes a substep into account; numbers beyond all bounds are no forces."""
-        square = self._sensors * self._sensors
-        square = square[:, 0::3] + square[:, 1::3] + square[:, 2::3]
-        # Most sensors are silent: copy only where there is something new.
-        more = np.flatnonzero((square > self._square) & (square < 1e30))
-        self._square.ravel()[more] = square.ravel()[more]
-        self._force.reshape(-1, 3)[more] = self._sensors.reshape(-1, 3)[more]
+        """Takes a substep into account."""
+        force = self._sensors.astype(np.float32, order="C").reshape(-1, 3, self._out.num_worlds)
+        square = np.einsum("kin,kin->kn", force, force)
+        if self._largest is None:
+            self._largest = force, square
+            return
+        largest, peak = self._largest
+        more = square > peak
+        np.copyto(peak, square, where=more)
+        np.copyto(largest, force, where=more[:, None])
 
     def show(self) -> None:
-        """After the last substep."""
-        ground, last = self._split
-        self._out.ground_force[:] = self._force[:, :ground].T
-        self._out.pair_force[:] = np.sqrt(self._square[:, ground:last]).T
+        """After the last substep. Numbers beyond all bounds are no forces."""
+        assert self._largest is not None
+        force, square = self._largest
+        wild = ~(square < 1e30)
+        if wild.any():
+            force[np.broadcast_to(wild[:, None], force.shape)] = square[wild] = 0.0
+        self._out.ground_force[:] = force[: self._ground].swapaxes(0, 1)
+        self._out.pair_force[:] = np.sqrt(square[self._ground :])
+        self._largest = None

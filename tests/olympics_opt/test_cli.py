@@ -224,13 +224,13 @@ def test_an_exported_policy_plays_like_its_run(tmp_path: Path, capsys):
     assert policy.metadata["looks"] == "idle"
     obs = 3.0 * torch.randn(20, 1, policy.metadata["obs_size"])
     torch.testing.assert_close(policy(obs), whole(obs), atol=5e-3, rtol=5e-3)  # fp16
-    small = PPOConfig(hidden=(16, 16), steps=4, minibatches=1, epochs=1)
+    small = PPOConfig(hidden=(16, 16), steps=4, minibatches=1, epochs=2)
     seen = []
     tuned = TrainConfig(
         "long_jump", tmp_path / "tuned", worlds=2, samples=8, init=str(out), ppo=small, quiet=True
     )
     train(tuned, on_iteration=seen.append)
-    assert seen[0]["kl"] > 0.0  # its actor learns at once: there is a critic
+    assert seen[0]["kl"] > 1e-6  # its actor learns at once: there is a critic
 
     # An evaluation of the export is one of the run; that of another policy is refused.
     again = f"export {run} --out {out} --critic --result {tmp_path / 'again.json'}"

@@ -93,7 +93,7 @@ def test_plain_mujoco_with_the_keeper_is_the_engine(forces):
 
 def test_a_model_without_the_sensors_gets_a_sentence():
     model = build_model(load_body(), sensors=False)
-    with pytest.raises(ValueError, match="no sensor 'angmom:agent0/Pelvis'"):
+    with pytest.raises(ValueError, match="no sensor 'subtreeangmom:agent0/Pelvis'"):
         AthleteKeeper(model, rows_of(mujoco.MjData(model)), ROOT)
 
 

@@ -356,8 +356,8 @@ def test_two_athletes_share_a_world():
         ctrl = 0.2 * torch.randn(1, body.num_dofs, generator=generator)
         alone.step(ctrl)
         pair.step(torch.cat((ctrl, ctrl), dim=1))
-    one = proprioception(alone, Heading(alone.body_quat[:, :, 0]))
-    two = proprioception(pair, Heading(pair.body_quat[:, :, 0]))
+    one = proprioception(alone, Heading(alone.body_rot[:, :, 0]))
+    two = proprioception(pair, Heading(pair.body_rot[:, :, 0]))
     assert two.shape == (1, 2, 358)
     assert (two[:, 0] - one[:, 0]).abs().max() < 1e-3
     assert (two[:, 1] - one[:, 0]).abs().max() < 1e-3
