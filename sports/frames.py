@@ -8,15 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from sports.physics.base import Physics
-
-Array = Any
-"""A numpy array or a torch tensor."""
 
 
 class Heading:
@@ -53,13 +49,13 @@ def proprioception_slices(num_links: int) -> dict[str, slice]:
 
 
 def fill_proprioception(
-    rows: Array, cos: Array, sin: Array, pos: Array, rot: Array, linvel: Array, angvel: Array
+    rows: Tensor, cos: Tensor, sin: Tensor, pos: Tensor, rot: Tensor, linvel: Tensor, angvel: Tensor
 ) -> None:
     """Writes :func:`proprioception` of one athlete into ``rows`` (15 B - 2, N), from its heading
     ``cos`` and ``sin`` (N), its links' positions and velocities (3, B, N) and R_WB (3, 3, B, N).
 
-    For numpy and torch alike. Components come first and worlds last: a row for each number is
-    quick on a CPU, three numbers for each row are not.
+    Components come first and worlds last: a row for each number is quick on a CPU, three numbers
+    for each row are not.
     """
     rows[0] = pos[2, 0]
     at = 1

@@ -225,6 +225,10 @@ class Geometry:
         return (body_pos * direction).sum(-1) + reach.amax(-1)
 
 
+GRAVITY = np.array((0.0, 0.0, -9.81))
+"""m/s^2"""
+NO_FORCE = 0.1
+"""A root force (N, N m) below this is rounding of self-contacts: the athlete touches nothing."""
 SPEED_LIMIT = 2000.0
 """A generalised velocity above this (m/s or rad/s) means that a world has diverged. A bar hit at
 12 m/s spins about its thin axis at 400 rad/s."""

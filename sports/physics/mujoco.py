@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from sports.humanoid.mjcf import build_model
+from sports.physics.athletes import tree_of
 from sports.physics.base import Geometry, PhysicsState, default_state
-from sports.physics.kinematics import Kinematics
-from sports.physics.results import Display, Results, Shown
+from sports.physics.results import Results, Shown, show
 from sports.physics.variation import Variation, draw
 from sports.physics.worlds import Worlds
 from sports.scene import Scene
@@ -36,13 +36,13 @@ class MujocoPhysics:
         self.threads = threads = threads or os.cpu_count() or 1
         self.device = torch.device("cpu")
         self.model = model = build_model(scene)
-        self._kinematics = kinematics = Kinematics(model, scene.body)
+        self._trees = [tree_of(model, scene, agent) for agent in range(scene.num_agents)]
         self.geometry = Geometry(scene.body, self.device)
         drawn = None
         if variation is not None:
             drawn = draw(variation, n, scene.substeps, variation_seed)
         self._out = out = Results(scene, n)
-        self._worlds = Worlds(scene, model, kinematics, threads, out, drawn)
+        self._worlds = Worlds(scene, model, self._trees, threads, out, drawn)
         shown = Shown(scene, self.geometry, out)
         self.qpos, self.qvel, self.mocap_pos = shown.qpos, shown.qvel, shown.mocap_pos
         self.body_pos, self.body_quat, self.body_rot = (
@@ -69,30 +69,23 @@ class MujocoPhysics:
             self.reset(self.bad, safe)
 
     def reset(self, mask: Tensor, state: PhysicsState) -> None:
-        ids = np.flatnonzero(mask.numpy())
-        if ids.size:
-            rows = [x.numpy()[ids] for x in (state.qpos, state.qvel, state.mocap_pos)]
-            self._worlds.put(ids, *rows)
-            self._out.put(ids, self._results(*rows).by_world)
+        worlds = mask.nonzero()[:, 0]
+        if worlds.numel():
+            self.restart(worlds, self.prepare(state))
 
     def prepare(self, state: PhysicsState) -> Shown:
-        """What every world would show after a reset to its row of ``state``, for ``restart``:
-        for all together this costs little more than for a few."""
-        arrays = (x.numpy() for x in (state.qpos, state.qvel, state.mocap_pos))
-        return Shown(self.scene, self.geometry, self._results(*arrays))
+        """What every world would show after a reset to its row of ``state``, for ``restart``."""
+        out = Results(self.scene, self.num_worlds)
+        qpos, qvel = state.qpos.double().numpy(), state.qvel.double().numpy()
+        show(self.scene, self._trees, qpos, qvel, out)
+        out.mocap_pos[:] = state.mocap_pos.permute(1, 2, 0).numpy()
+        return Shown(self.scene, self.geometry, out)
 
     def restart(self, worlds: Tensor, prepared: Shown) -> None:
         """Resets worlds (n,), by index, to what was prepared."""
-        ids, out = worlds.numpy(), prepared.results
-        rows = out.by_world[ids]
-        self._worlds.put(ids, *out.states(rows))
-        self._out.put(ids, rows)
-
-    def _results(self, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> Results:
-        """Of states (n, nq), (n, nv), (n, M, 3) without contacts."""
-        out = Results(self.scene, len(qpos))
-        Display(self.scene, self._kinematics, out).state(qpos, qvel, mocap)
-        return out
+        ids = worlds.numpy()
+        self._out.put(ids, prepared.results)
+        self._worlds.take(ids)
 
     def extent(self, direction: Tensor) -> Tensor:
         return self.geometry.extent(self.body_pos, self.body_quat, direction)
@@ -100,8 +93,7 @@ class MujocoPhysics:
     def extra_state(self) -> dict[str, Tensor]:
         """Double-precision state and the solver's warm start: with them a resumed run repeats
         the interrupted one bit for bit."""
-        worlds = self._worlds
-        keepers = [keeper.expected for keeper in worlds.keepers]
+        worlds, keepers = self._worlds, self._worlds.keepers
         arrays = {
             "qpos": worlds.qpos.copy(),
             "qvel": worlds.qvel.copy(),

@@ -1,23 +1,22 @@
 """What the ``mujoco`` engine shows of its worlds after a step or a reset.
 
-Float32 arrays with the components first and the worlds last: an operation on one component then
-runs over all links and worlds at once.
+Float32 arrays with the components first and the worlds last: what a task does with one component
+then runs over all links and worlds at once. Only what is felt has the worlds first, as the
+observation that it becomes a part of.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sports.frames import fill_proprioception
+from sports.physics.athletes import Athlete, Tree, show_athlete, show_object, turn_over
 from sports.physics.base import SPEED_LIMIT, Geometry
-from sports.physics.kinematics import Kinematics, Pose
-from sports.physics.vectors import rotation
 from sports.scene import Scene
 
 
@@ -46,7 +45,6 @@ class Results:
             "qvel": (scene.nv,),
             "mocap_pos": (len(scene.mocap_objects), 3),
             "rotation": (3, 3, agents, links),
-            "felt": (agents, 15 * links - 2),
             "whole": (6, agents),
             "ground_force": (3, agents * links),
             "pair_force": (len(scene.contact_pairs),),
@@ -73,8 +71,8 @@ class Results:
         """(3, 3, A, B, N) R_WB of the links."""
         self.objects = _motion(parts, "objects")
         """(O, N)"""
-        self.felt = parts["felt"]
-        """(A, 15 B - 2, N) as ``Physics.felt``"""
+        self.felt = np.zeros((num_worlds, agents, 15 * links - 2), np.float32)
+        """(N, A, 15 B - 2) as ``Physics.felt``"""
         self.whole = parts["whole"]
         """(6, A, N) as ``Physics.whole``"""
         self.ground_force = parts["ground_force"]
@@ -82,31 +80,28 @@ class Results:
         self.pair_force = parts["pair_force"]
         """(P, N) as ``Physics.pair_force``"""
 
-    @cached_property
-    def by_world(self) -> np.ndarray:
-        """(N, ...) a copy with the worlds first, quick to pick a few from."""
-        return np.ascontiguousarray(self._all.T)
-
-    def states(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """qpos (n, nq), qvel (n, nv) and mocap_pos (n, M, 3) in rows of ``by_world``."""
-        nq, nv, moved = len(self.qpos), len(self.qvel), self.mocap_pos.size // self.num_worlds
-        qpos, qvel, mocap, _ = np.split(rows, np.cumsum((nq, nv, moved)), axis=1)
-        return qpos, qvel, mocap.reshape(len(rows), moved // 3, 3)
-
-    def put(self, worlds: np.ndarray, rows: np.ndarray) -> None:
-        """Makes worlds, by index, those of some rows of ``by_world``."""
-        self._all[:, worlds] = rows.T
+    def put(self, worlds: np.ndarray, source: Results) -> None:
+        """Makes worlds, by index, those of other results."""
+        self._all[:, worlds] = source._all[:, worlds]
+        self.felt[worlds] = source.felt[worlds]
 
     def diverged(self) -> np.ndarray:
         """(N,) bool, as ``sports.physics.base.diverged``."""
         furthest, fastest = np.abs(self.qpos).max(0), np.abs(self.qvel).max(0)
         return ~((furthest < np.inf) & (fastest < SPEED_LIMIT))
 
-    def pose(self, agent: int) -> Pose:
-        """Of the athlete; views."""
-        links, rot = self.links, self.rotation[:, :, agent]
-        parts = (v[:, agent] for v in (links.pos, links.angvel, links.linvel))
-        return Pose(links.quat[:, agent], rot, *parts)
+    def athlete(self, agent: int) -> Athlete:
+        """What is shown of an athlete; views."""
+        links = self.links
+        return Athlete(
+            quat=links.quat[:, agent],
+            rot=self.rotation[:, :, agent],
+            pos=links.pos[:, agent],
+            linvel=links.linvel[:, agent],
+            angvel=links.angvel[:, agent],
+            felt=self.felt[:, agent],
+            whole=self.whole[:, agent],
+        )
 
 
 _SIZES = {"pos": 3, "quat": 4, "linvel": 3, "angvel": 3}
@@ -128,7 +123,7 @@ class Shown:
         self.body_pos, self.body_quat = _turned(links.pos), _turned(links.quat)
         self.body_linvel, self.body_angvel = _turned(links.linvel), _turned(links.angvel)
         self.body_rot = torch.from_numpy(results.rotation).permute(4, 2, 3, 0, 1)
-        self.felt = torch.from_numpy(results.felt).permute(2, 0, 1)
+        self.felt = torch.from_numpy(results.felt)
         self.whole = _turned(results.whole)
         self.object_pos, self.object_quat = _turned(objects.pos), _turned(objects.quat)
         self.object_linvel, self.object_angvel = _turned(objects.linvel), _turned(objects.angvel)
@@ -146,45 +141,28 @@ def _turned(array: np.ndarray) -> Tensor:
     return turned.movedim(1, -1)
 
 
-class Display:
-    """Writes results from states."""
+def show_state(scene: Scene, qpos: np.ndarray, qvel: np.ndarray, out: Results) -> None:
+    """The state itself (N, nq), (N, nv), float64, and the free objects."""
+    turn_over(qpos, out.qpos)
+    turn_over(qvel, out.qvel)
+    for k, o in enumerate(scene.free_objects):
+        state = qpos[:, scene.object_qpos(o.name)], qvel[:, scene.object_qvel(o.name)]
+        show_object(*state, *(getattr(out.objects, f.name)[:, k] for f in fields(Motion)))
 
-    def __init__(self, scene: Scene, kinematics: Kinematics, out: Results) -> None:
-        self._scene, self._kinematics, self._out = scene, kinematics, out
-        self.poses = [out.pose(agent) for agent in range(scene.num_agents)]
 
-    def state(self, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
-        """Everything but forces, of states (n, nq), (n, nv), (n, M, 3)."""
-        with np.errstate(all="ignore"):
-            self.given(qpos, qvel, mocap)
-            for agent, pose in enumerate(self.poses):
-                self.pose(agent)
-                root = qpos[:, self._scene.agent_qpos(agent)][:, :3].T
-                whole = self._kinematics.whole(pose)
-                self._out.whole[:, agent] = np.concatenate((root + whole.com, whole.velocity))
-                self.athlete(agent, root)
+def show(
+    scene: Scene, trees: Sequence[Tree], qpos: np.ndarray, qvel: np.ndarray, out: Results
+) -> None:
+    """Everything but fixtures and forces, of a state (N, nq), (N, nv), float64."""
+    show_state(scene, qpos, qvel, out)
+    sin, cos = half_angles(qpos)
+    for agent, tree in enumerate(trees):
+        show_athlete(tree, qpos, qvel, sin, cos, out.athlete(agent))
 
-    def given(self, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
-        """The state itself, and the objects."""
-        out, objects, scene = self._out, self._out.objects, self._scene
-        out.qpos[:], out.qvel[:], out.mocap_pos[:] = qpos.T, qvel.T, mocap.transpose(1, 2, 0)
-        for k, o in enumerate(scene.free_objects):
-            pos, quat = np.split(out.qpos[scene.object_qpos(o.name)], [3])
-            linear, spin = np.split(out.qvel[scene.object_qvel(o.name)], 2)
-            objects.pos[:, k], objects.linvel[:, k] = pos, linear
-            unit = np.divide(quat, np.sqrt((quat * quat).sum(0)), out=objects.quat[:, k])
-            turn = rotation(unit, np.empty((3, 3, out.num_worlds), np.float32))
-            np.einsum("ijn,jn->in", turn, spin, out=objects.angvel[:, k])
 
-    def pose(self, agent: int) -> None:
-        """The links of an athlete, as the shown state has them, with positions from the root."""
-        qpos, qvel = self._scene.agent_qpos(agent), self._scene.agent_qvel(agent)
-        self._kinematics.pose(self._out.qpos[qpos], self._out.qvel[qvel], self.poses[agent])
-
-    def athlete(self, agent: int, root: np.ndarray) -> None:
-        """Puts the links of an athlete to its root (3, n), and what it feels."""
-        pose = self.poses[agent]
-        pose.pos[:] += root.astype(np.float32)[:, None]
-        yaw = np.arctan2(pose.rot[1, 0, 0], pose.rot[0, 0, 0])
-        motion = (pose.pos, pose.rot, pose.velocity, pose.spin)
-        fill_proprioception(self._out.felt[agent], np.cos(yaw), np.sin(yaw), *motion)
+def half_angles(qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, nq) sines and cosines of half of qpos, of which only the joints' mean something; quicker
+    in numpy than one by one."""
+    half = 0.5 * qpos
+    with np.errstate(invalid="ignore"):  # of a world that has diverged
+        return np.sin(half), np.cos(half)

@@ -16,8 +16,7 @@ import warp as wp
 from torch import Tensor
 
 from sports.humanoid.mjcf import GROUND, body_name, build_model
-from sports.physics.base import Geometry, PhysicsState, diverged
-from sports.physics.momentum import GRAVITY, NO_FORCE
+from sports.physics.base import GRAVITY, NO_FORCE, Geometry, PhysicsState, diverged
 from sports.physics.variation import Draw, Variation, contact_softness, draw
 from sports.scene import Scene
 
