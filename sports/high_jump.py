@@ -293,7 +293,7 @@ def _lowest_over_bar(view: View) -> Tensor:
         for axis in (0, 2)
     )
     aside = (x - BAR_X).abs() >= 0.05
-    return torch.where(aside, torch.inf, z - geometry.link_radii).amin((1, 2))
+    return torch.where(aside, torch.inf, z - geometry.link_radii).amin(1)
 
 
 TASK = Task(

@@ -92,7 +92,7 @@ def advance(view: View, memory: Memory) -> Advance:
     goal = constant(GOAL, root.device)
     touched = view.touching()[:, 0]  # (N, B) in any substep
     geometry = view.geometry
-    points_x, points_z = (  # (N, B, K')
+    points_x, points_z = (  # (N, L)
         geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0], axis)
         for axis in (0, 2)
     )
@@ -103,23 +103,23 @@ def advance(view: View, memory: Memory) -> Advance:
     # A link that touched within the step and is off again: all of it was at or beyond this x.
     brief = touched & ~standing
     brief_x = torch.where(brief, torch.minimum(rear, memory["rear"]), torch.inf)
-    any_contact = (touched | standing).any(-1)
+    nearest = torch.minimum(torch.where(above, torch.inf, points_x).amin(1), brief_x.amin(1))
+    front = torch.where(above, -torch.inf, points_x).amax(1)
+    front = torch.maximum(front, torch.where(brief, brief_x, -torch.inf).amax(1))
+    touches = nearest < torch.inf
 
     mode = memory["mode"]
-    running = mode == RUN
-    front = torch.where(above, -torch.inf, points_x).amax((1, 2))
-    brief_front = torch.where(brief, brief_x, -torch.inf).amax(-1)
-    foul = running & ((front >= LINE_X) | (brief_front >= LINE_X))
+    running, over_line = mode == RUN, x > LINE_X
+    foul = running & (front >= LINE_X)
     fell = running & view.fallen()[:, 0]
-    half_width = torch.where(x <= LINE_X, RUNWAY_HALF_WIDTH, PIT_HALF_WIDTH)
+    half_width = RUNWAY_HALF_WIDTH + (PIT_HALF_WIDTH - RUNWAY_HALF_WIDTH) * over_line
     off_track = y.abs() > half_width
 
-    takes_off = running & ~any_contact & (x > LINE_X)
-    lands = (mode == FLIGHT) & any_contact
-    mode = torch.where(takes_off, FLIGHT, torch.where(lands, LANDED, mode))
+    takes_off = running & ~touches & over_line
+    lands = (mode == FLIGHT) & touches
+    mode = mode + takes_off + lands  # from RUN to FLIGHT to LANDED
     landed = mode == LANDED
-    nearest = torch.minimum(torch.where(above, torch.inf, points_x).amin((1, 2)), brief_x.amin(-1))
-    mark = torch.where(landed, torch.minimum(memory["mark"], nearest), memory["mark"])
+    mark = torch.minimum(memory["mark"], nearest.masked_fill(~landed, torch.inf))
     since_landing = memory["since_landing"] + (landed & ~lands)
     measured = landed & (since_landing >= MARK_STEPS)
     failed = foul | fell | off_track
@@ -141,16 +141,15 @@ def advance(view: View, memory: Memory) -> Advance:
     flight_steps = memory["flight_steps"] + flying
     turn = view.physics.body_angvel[:, 0, 0, 1] * view.control_timestep
     rotation_angle = memory["rotation"] + turn * flying
-    legal = ~success
-    metrics = {
-        "success": success.float(),
-        "length": nan_where(legal, length),
-        "flight_time": nan_where(legal, flight_steps * view.control_timestep),
-        "rotation": nan_where(legal, rotation_angle),
-        "takeoff_speed": nan_where(legal, takeoff_speed),
-        "length_bound": nan_where(legal, length_bound(takeoff_speed, takeoff_com_z, landing_com_z)),
-        "foul": foul.float(),
+    measures = {
+        "length": length,
+        "flight_time": flight_steps * view.control_timestep,
+        "rotation": rotation_angle,
+        "takeoff_speed": takeoff_speed,
+        "length_bound": length_bound(takeoff_speed, takeoff_com_z, landing_com_z),
     }
+    metrics = dict(zip(measures, nan_where(~success, torch.stack(tuple(measures.values())))))
+    metrics |= {"success": success.float(), "foul": foul.float()}
     memory = {
         "root": root.clone(),
         "rear": rear,
@@ -180,7 +179,7 @@ def length_bound(speed: Tensor, takeoff_z: Tensor, landing_z: Tensor) -> Tensor:
 
 
 def _rear(view: View, points_x: Tensor) -> Tensor:
-    """(N, B) smallest x of each link, of its support points' x (N, B, K')."""
+    """(N, B) smallest x of each link, of the support points' x (N, K)."""
     return view.geometry.least(points_x - view.geometry.link_radii)
 
 

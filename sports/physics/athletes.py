@@ -274,13 +274,10 @@ def pose_links(
     tree: Tree,
     qpos: np.ndarray,
     qvel: np.ndarray,
-    sin: np.ndarray,
-    cos: np.ndarray,
     w: int,
     pose: Pose,
 ) -> None:
-    """The links of world ``w`` from qpos (N, nq) and qvel (N, nv); ``sin`` and ``cos`` (N, nq) are
-    those of qpos / 2."""
+    """The links of world ``w`` from qpos (N, nq) and qvel (N, nv)."""
     q, v = tree.qpos, tree.qvel
     root = unit(qpos[w, q + 3], qpos[w, q + 4], qpos[w, q + 5], qpos[w, q + 6])
     turn = put_attitude(pose, 0, root)
@@ -290,8 +287,9 @@ def pose_links(
     for i in range(1, len(tree.parent)):
         p = tree.parent[i]
         q, v = tree.qpos + 4 + 3 * i, tree.qvel + 3 + 3 * i
-        sa, sb, sc = sin[w, q], sin[w, q + 1], sin[w, q + 2]
-        ca, cb, cc = cos[w, q], cos[w, q + 1], cos[w, q + 2]
+        a, b, c = 0.5 * qpos[w, q], 0.5 * qpos[w, q + 1], 0.5 * qpos[w, q + 2]
+        sa, sb, sc = math.sin(a), math.sin(b), math.sin(c)
+        ca, cb, cc = math.cos(a), math.cos(b), math.cos(c)
         joint = (  # Rx Ry Rz
             ca * cb * cc - sa * sb * sc,
             sa * cb * cc + ca * sb * sc,
@@ -404,14 +402,12 @@ def show_athlete(
     tree: Tree,
     qpos: np.ndarray,
     qvel: np.ndarray,
-    sin: np.ndarray,
-    cos: np.ndarray,
     out: Athlete,
 ) -> None:
     """Shows an athlete of states (N, nq), (N, nv)."""
     pose = new_pose(len(tree.parent))
     for w in range(len(qpos)):
-        pose_links(tree, qpos, qvel, sin, cos, w, pose)
+        pose_links(tree, qpos, qvel, w, pose)
         _, _, velocity, com = whole_of(tree, pose)
         write(pose, com, velocity, w, out)
 
@@ -535,8 +531,6 @@ def finish_athlete(
     constraint: np.ndarray,
     qpos: np.ndarray,
     qvel: np.ndarray,
-    sin: np.ndarray,
-    cos: np.ndarray,
     out: Athlete,
 ) -> None:
     """Keeps an athlete's momentum after the last substep of a control step and shows it.
@@ -547,7 +541,7 @@ def finish_athlete(
     pose = new_pose(len(tree.parent))
     q, v = tree.qpos, tree.qvel
     for w in range(len(qpos)):
-        pose_links(tree, qpos, qvel, sin, cos, w, pose)
+        pose_links(tree, qpos, qvel, w, pose)
         inertia, angular, velocity, com = whole_of(tree, pose)
         turn, speed, shift = keep(
             kept,
@@ -596,11 +590,12 @@ def show_object(
 
 
 @compiled
-def turn_over(rows: np.ndarray, columns: np.ndarray) -> None:
-    """Writes (N, k) to (k, N)."""
+def show_numbers(rows: np.ndarray, columns: np.ndarray, limit: float, bad: np.ndarray) -> None:
+    """Writes (N, k) to (k, N); sets ``bad`` (N,) where a number is not below a limit, or is NaN."""
     for j in range(len(columns)):
         for w in range(len(rows)):
             columns[j, w] = rows[w, j]
+            bad[w] |= not abs(rows[w, j]) < limit
 
 
 @compiled
@@ -624,3 +619,28 @@ def look_at_contacts(
                     ground[0, i, w], ground[1, i, w], ground[2, i, w] = x, y, z
                 else:
                     pairs[i - links, w] = math.sqrt(square)
+
+
+# Points on the links' surfaces.
+
+
+@compiled
+def place_points(
+    points: np.ndarray, owners: np.ndarray, pos: np.ndarray, turn: np.ndarray, out: np.ndarray
+) -> None:
+    """Writes one world coordinate of points (K, 3) of links ``owners`` (K,) to (K, N), from that
+    of the links' origins (B, N) and that row of their R_WB (3, B, N)."""
+    for k in range(len(points)):
+        i, x, y, z = owners[k], points[k, 0], points[k, 1], points[k, 2]
+        for w in range(out.shape[1]):
+            out[k, w] = pos[i, w] + turn[0, i, w] * x + turn[1, i, w] * y + turn[2, i, w] * z
+
+
+@compiled
+def least_of_links(owners: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
+    """Writes the least of each link's ``values`` (K, N) to (B, N)."""
+    out[:] = np.inf
+    for k in range(len(owners)):
+        i = owners[k]
+        for w in range(out.shape[1]):
+            out[i, w] = min(out[i, w], values[k, w])

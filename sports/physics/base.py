@@ -148,9 +148,9 @@ class Geometry:
         self.radii = torch.tensor(radii, dtype=torch.float32, device=device)
         self.owner = torch.tensor(owner, device=device)
         """(K,) link index."""
-        # Padded per link, so that a reduction over a link's points is one gather and one max.
         counts = np.bincount(owner, minlength=body.num_links)
         starts = np.concatenate(([0], np.cumsum(counts)[:-1]))
+        # Padded per link, so that a reduction over a link's points is one gather and one max.
         padded = starts[:, None] + np.minimum(np.arange(counts.max()), counts[:, None] - 1)
         self.padded = torch.tensor(padded, device=device)
         mass = np.array([sum(s.mass for s in link.shapes) for link in body.links])
@@ -174,25 +174,24 @@ class Geometry:
     def _padded_radii(self) -> Tensor:
         return self.radii[self.padded]
 
+    @cached_property
+    def link_radii(self) -> Tensor:
+        """(L,) radii of the balls around ``link_points``."""
+        return self._padded_radii.T.flatten()
+
     def link_points(self, body_pos: Tensor, rotation: Tensor, axis: int) -> Tensor:
-        """(N, B, K') coordinate along a world axis of the support points, by link and padded by
-        repetition to the link with most; the balls around them have ``link_radii`` (B, K').
-        ``body_pos`` (N, B, 3) and ``rotation`` R_WB (N, B, 3, 3) are the links'."""
+        """(N, L) coordinate along a world axis of the support points, in an order of its own and
+        perhaps some more than once; the balls around them have ``link_radii``. ``body_pos``
+        (N, B, 3) and ``rotation`` R_WB (N, B, 3, 3) are the links'."""
         # Worlds in the last axis: rows of three numbers and tiny products are slow on a CPU.
         x, y, z = rotation[:, :, axis].permute(2, 1, 0)  # (B, N) each
         px, py, pz = self._point_columns  # (K', B, 1) each
         points = torch.addcmul(body_pos[:, :, axis].T, x, px).addcmul_(y, py).addcmul_(z, pz)
-        return points.permute(2, 1, 0)
+        return points.flatten(0, 1).T
 
-    @staticmethod
-    def least(values: Tensor) -> Tensor:
-        """(N, B) least of each link's ``values`` (N, B, K')."""
-        return values.permute(2, 1, 0).amin(0).T
-
-    @property
-    def link_radii(self) -> Tensor:
-        """(B, K') radii of the balls around ``link_points``."""
-        return self._padded_radii
+    def least(self, values: Tensor) -> Tensor:
+        """(N, B) least of each link's ``values`` (N, L), one for each of its ``link_points``."""
+        return values.T.unflatten(0, (-1, self.num_links)).amin(0).T
 
     def world_points(self, body_pos: Tensor, body_quat: Tensor) -> Tensor:
         """(..., K, 3) support points in the world; the balls around them have ``radii``."""

@@ -69,10 +69,14 @@ class AthleteKeeper:
         q, v = model.jnt_qposadr[body.jntadr[0]], model.jnt_dofadr[body.jntadr[0]]
         first = model.sensor(f"{WHOLE_SENSORS[0].lower()}:{root}").adr[0]
         self._motion = bind("sensordata")[n, first : first + 3 * len(WHOLE_SENSORS)]
-        self._inertia = bind("crb")[n, body.id, :6]
-        self._constraint = bind("qfrc_constraint")[n, v : v + 6]
-        self._qpos, self._qvel = bind("qpos")[n, q : q + 7], bind("qvel")[n, v : v + 6]
-        mass, num = float(model.body_subtreemass[body.id]), len(self._qpos)
+        self._fields = (
+            self._motion,
+            bind("crb")[n, body.id, :6],
+            bind("qfrc_constraint")[n, v : v + 6],
+            bind("qpos")[n, q : q + 7],
+            bind("qvel")[n, v : v + 6],
+        )
+        mass, num = float(model.body_subtreemass[body.id]), len(self._motion)
         self.kept = Kept(
             expected=np.full((num, 9), np.nan),
             timestep=np.full(num, model.opt.timestep),
@@ -118,11 +122,10 @@ class AthleteKeeper:
         after it (but for the constraint forces, which are always of the substep).
 
         Returns (N, 6) the added spatial velocity (rotation, then velocity of the centre of mass,
-        as ``cvel``; world) and (N, 3) the shift of the whole athlete.
+        as ``cvel``; world) and (N, 3) the shift of the whole athlete: views, until the next call.
         """
-        fields = (self._motion, self._inertia, self._constraint)
-        keep_measured(self.kept, current, *fields, self._qpos, self._qvel, self._added)
-        return self._added[:, :6].copy(), self._added[:, 6:].copy()
+        keep_measured(self.kept, current, *self._fields, self._added)
+        return self._added[:, :6], self._added[:, 6:]
 
 
 def rows_of(data: mujoco.MjData) -> Bind:

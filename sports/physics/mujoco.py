@@ -10,8 +10,9 @@ from torch import Tensor
 
 from sports.humanoid.mjcf import build_model
 from sports.physics.athletes import tree_of
-from sports.physics.base import Geometry, PhysicsState, default_state
+from sports.physics.base import PhysicsState, default_state
 from sports.physics.results import Results, Shown, show
+from sports.physics.surface import CompiledGeometry
 from sports.physics.variation import Variation, draw
 from sports.physics.worlds import Worlds
 from sports.scene import Scene
@@ -37,7 +38,7 @@ class MujocoPhysics:
         self.device = torch.device("cpu")
         self.model = model = build_model(scene)
         self._trees = [tree_of(model, scene, agent) for agent in range(scene.num_agents)]
-        self.geometry = Geometry(scene.body, self.device)
+        self.geometry = CompiledGeometry(scene.body, self.device)
         drawn = None
         if variation is not None:
             drawn = draw(variation, n, scene.substeps, variation_seed)
@@ -61,7 +62,7 @@ class MujocoPhysics:
 
     def step(self, ctrl: Tensor) -> None:
         self._worlds.step(ctrl.numpy())
-        self.bad = torch.from_numpy(self._out.diverged())
+        self.bad = torch.from_numpy(self._out.bad.copy())
         if self.bad.any():
             self.nan_worlds += int(self.bad.sum())
             safe = default_state(self.scene, self.num_worlds, self.device)

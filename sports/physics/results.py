@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sports.physics.athletes import Athlete, Tree, show_athlete, show_object, turn_over
+from sports.physics.athletes import Athlete, Tree, show_athlete, show_numbers, show_object
 from sports.physics.base import SPEED_LIMIT, Geometry
 from sports.scene import Scene
 
@@ -80,15 +81,18 @@ class Results:
         self.pair_force = parts["pair_force"]
         """(P, N) as ``Physics.pair_force``"""
 
-    def put(self, worlds: np.ndarray, source: Results) -> None:
-        """Makes worlds, by index, those of other results."""
-        self._all[:, worlds] = source._all[:, worlds]
-        self.felt[worlds] = source.felt[worlds]
+        self.bad = np.zeros(num_worlds, np.bool_)
+        """(N,) bool: the numbers of the state are those of ``sports.physics.base.diverged``."""
 
-    def diverged(self) -> np.ndarray:
-        """(N,) bool, as ``sports.physics.base.diverged``."""
-        furthest, fastest = np.abs(self.qpos).max(0), np.abs(self.qvel).max(0)
-        return ~((furthest < np.inf) & (fastest < SPEED_LIMIT))
+    @cached_property
+    def by_world(self) -> np.ndarray:
+        """(N, ...) a copy with the worlds first, quick to pick a few from."""
+        return np.ascontiguousarray(self._all.T)
+
+    def put(self, worlds: np.ndarray, source: Results) -> None:
+        """Makes worlds, by index, those of other results that do not change any more."""
+        self._all[:, worlds] = source.by_world[worlds].T
+        self.felt[worlds] = source.felt[worlds]
 
     def athlete(self, agent: int) -> Athlete:
         """What is shown of an athlete; views."""
@@ -143,8 +147,9 @@ def _turned(array: np.ndarray) -> Tensor:
 
 def show_state(scene: Scene, qpos: np.ndarray, qvel: np.ndarray, out: Results) -> None:
     """The state itself (N, nq), (N, nv), float64, and the free objects."""
-    turn_over(qpos, out.qpos)
-    turn_over(qvel, out.qvel)
+    out.bad[:] = False
+    show_numbers(qpos, out.qpos, np.inf, out.bad)
+    show_numbers(qvel, out.qvel, SPEED_LIMIT, out.bad)
     for k, o in enumerate(scene.free_objects):
         state = qpos[:, scene.object_qpos(o.name)], qvel[:, scene.object_qvel(o.name)]
         show_object(*state, *(getattr(out.objects, f.name)[:, k] for f in fields(Motion)))
@@ -155,14 +160,5 @@ def show(
 ) -> None:
     """Everything but fixtures and forces, of a state (N, nq), (N, nv), float64."""
     show_state(scene, qpos, qvel, out)
-    sin, cos = half_angles(qpos)
     for agent, tree in enumerate(trees):
-        show_athlete(tree, qpos, qvel, sin, cos, out.athlete(agent))
-
-
-def half_angles(qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, nq) sines and cosines of half of qpos, of which only the joints' mean something; quicker
-    in numpy than one by one."""
-    half = 0.5 * qpos
-    with np.errstate(invalid="ignore"):  # of a world that has diverged
-        return np.sin(half), np.cos(half)
+        show_athlete(tree, qpos, qvel, out.athlete(agent))

@@ -14,7 +14,7 @@ from mujoco.batch import Batch
 from sports.humanoid.mjcf import body_name
 from sports.physics.athletes import Tree, finish_athlete, look_at_contacts
 from sports.physics.momentum import AthleteKeeper
-from sports.physics.results import Results, half_angles, show, show_state
+from sports.physics.results import Results, show, show_state
 from sports.physics.variation import Draw, contact_softness
 from sports.scene import Scene
 
@@ -71,10 +71,9 @@ class Worlds:
             if i < self.scene.substeps - 1:
                 for keeper in self.keepers:
                     keeper.correct(current=False)
-        sin, cos = half_angles(self.qpos)
         for agent, (tree, keeper) in enumerate(zip(self._trees, self.keepers)):
             state = self._constraint, self.qpos, self.qvel
-            finish_athlete(tree, keeper.kept, *state, sin, cos, out.athlete(agent))
+            finish_athlete(tree, keeper.kept, *state, out.athlete(agent))
         show_state(self.scene, self.qpos, self.qvel, out)
 
     def take(self, ids: np.ndarray) -> None:
