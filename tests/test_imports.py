@@ -30,6 +30,10 @@ print("imported", len({modules}))
 
 DRAKE_ENGINE = ("sports.physics.drake", "sports.humanoid.drake_plant", "sports.humanoid.parity")
 WARP_ENGINE = ("sports.physics.warp",)
+MUJOCO_ENGINE = tuple(
+    f"sports.physics.{name}"
+    for name in ("athletes", "momentum", "mujoco", "results", "surface", "worlds")
+)
 HEADLESS = {"pydrake", "casadi", "OpenGL", "glfw", "ray", "tkinter"}
 
 
@@ -82,3 +86,29 @@ def test_without_warp_everything_else_imports(package):
     # Warp is the extra [gpu]: the engine that needs it says so when it is asked for.
     done = run_blocked(modules_below(package, WARP_ENGINE), {"warp", "mujoco_warp"})
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("package", ["sports", "rl", "olympics_opt"])
+def test_without_numba_everything_but_the_cpu_engine_imports(package):
+    # Training on a GPU does without it.
+    pytest.importorskip("mujoco_warp")
+    modules = modules_below(package, MUJOCO_ENGINE + DRAKE_ENGINE)
+    assert package != "sports" or set(WARP_ENGINE) <= set(modules)
+    done = run_blocked(modules, {"numba", "llvmlite"})
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_the_cpu_engine_without_numba_says_so():
+    code = """
+import sys
+sys.modules["numba"] = None
+from sports.env import make_env
+try:
+    make_env("long_jump", num_worlds=1)
+except RuntimeError as error:
+    print(error)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=240
+    )
+    assert "engine 'mujoco' needs numba (pip install numba)" in done.stdout, done.stderr[-2000:]

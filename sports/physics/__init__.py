@@ -21,8 +21,12 @@ def make_physics(engine: str, scene: Scene, num_worlds: int, **options: object) 
     if num_worlds < 1:
         raise ValueError(f"the number of worlds must be at least 1, not {num_worlds}")
     if engine == "mujoco":
-        from sports.physics.mujoco import MujocoPhysics
-
+        try:
+            from sports.physics.mujoco import MujocoPhysics
+        except ImportError as error:
+            raise RuntimeError(
+                f"engine 'mujoco' needs numba (pip install numba): {error}"
+            ) from error
         return MujocoPhysics(scene, num_worlds, **options)  # type: ignore[arg-type]
     if engine == "warp":
         try:

@@ -123,6 +123,78 @@ def test_link_velocities_are_the_derivatives_of_link_positions():
     assert (difference - physics.body_linvel).abs().max() < 1e-2
 
 
+def thrown(physics, seed):
+    """Athletes in random attitudes and motion, as shown after a reset; their states."""
+    n, scene = physics.num_worlds, physics.scene
+    generator = torch.Generator().manual_seed(seed)
+    state = default_state(scene, n, "cpu")
+    state.qpos[:, :3] = 3.0 * torch.randn(n, 3, generator=generator)
+    state.qpos[:, 3:7] = torch.nn.functional.normalize(torch.randn(n, 4, generator=generator))
+    state.qpos[:, 7:] = torch.randn(n, scene.nu, generator=generator)
+    state.qvel[:] = 3.0 * torch.randn(n, scene.nv, generator=generator)
+    physics.reset(torch.ones(n, dtype=torch.bool), state)
+    return state
+
+
+@pytest.mark.parametrize("name", ["smpl", "smplx"])
+def test_links_are_where_mujoco_has_them(name):
+    """The compiled kinematics of the CPU engine, against mj_forward link by link."""
+    scene = humanoid_scene(load_body(name))
+    physics = cpu(scene, 3)
+    state = thrown(physics, 3)
+    model = build_model(scene)
+    for i in range(3):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = state.qpos[i].numpy(), state.qvel[i].numpy()
+        mujoco.mj_forward(model, data)
+        mujoco.mj_subtreeVel(model, data)
+        for b, link in enumerate(scene.body.link_names):
+            body, twist = model.body(f"agent0/{link}").id, np.zeros(6)
+            kind = mujoco.mjtObj.mjOBJ_XBODY
+            mujoco.mj_objectVelocity(model, data, kind, body, twist, 0)
+            close = {
+                "body_pos": data.xpos[body],
+                "body_quat": data.xquat[body],
+                "body_rot": data.xmat[body].reshape(3, 3),
+                "body_angvel": twist[:3],
+                "body_linvel": twist[3:],
+            }
+            for field, expected in close.items():
+                got = getattr(physics, field)[i, 0, b]
+                np.testing.assert_allclose(got, expected, rtol=1e-6, atol=2e-6, err_msg=field)
+        whole = np.concatenate((data.subtree_com[1], data.subtree_linvel[1]))
+        np.testing.assert_allclose(physics.whole[i, 0], whole, rtol=1e-6, atol=2e-6)
+
+
+def test_what_is_felt_is_what_the_tensors_say():
+    """The compiled proprioception against the batched one of the other engines."""
+    physics = cpu(humanoid_scene(load_body()), 4)
+    thrown(physics, 8)
+    heading = Heading(physics.body_rot[:, :, 0])
+    quick = proprioception(physics, heading)
+    physics.felt = None
+    torch.testing.assert_close(quick, proprioception(physics, heading), rtol=1e-5, atol=2e-5)
+
+
+def test_points_of_the_links_are_those_of_the_table():
+    """Compiled and batched ``Geometry`` against the support points in the world."""
+    scene = humanoid_scene(load_body(equipment=("racket",)))
+    physics = cpu(scene, 5)
+    thrown(physics, 2)
+    compiled, plain = physics.geometry, Geometry(scene.body, "cpu")
+    pos, rot = physics.body_pos[:, 0], physics.body_rot[:, 0]
+    points = plain.world_points(physics.body_pos, physics.body_quat)[:, 0]
+    for axis in range(3):
+        surface = points[..., axis] - plain.radii
+        links = [surface[:, plain.owner == i].amin(1) for i in range(plain.num_links)]
+        for geometry in (compiled, plain):
+            along = geometry.link_points(pos, rot, axis)
+            furthest = along.amax(1), points[..., axis].amax(1)
+            torch.testing.assert_close(*furthest, rtol=1e-5, atol=1e-5)
+            least = geometry.least(along - geometry.link_radii)
+            torch.testing.assert_close(least, torch.stack(links, 1), rtol=1e-5, atol=1e-5)
+
+
 def test_extent_agrees_with_the_support_points():
     scene = humanoid_scene(load_body(equipment=("racket",)))
     physics = cpu(scene, 3)
