@@ -1,10 +1,9 @@
 """Worlds that differ a little, so that a policy cannot live on one engine's numbers.
 
 Violent motion on the ground depends on the time step of every engine: a policy trained on one
-world alone won 91 % of its long jumps at 1/120 s and none at 1/240 s or in Drake; one that had seen
-half the step and a narrow range of contacts cleared the high bar at 1/120, 1/240 and 1/480 s but
-fell in Drake within 1 s (measured). In training each world may have its own friction, gains,
-contact softness and damping, and time step; the ranges reach from MuJoCo's ground past Drake's.
+world alone won 91 % of its long jumps at 1/120 s and none at 1/240 s or in Drake (measured, on
+MuJoCo's default ground). In training each world may have its own friction, gains, contact softness,
+damping and impedance, and time step.
 """
 
 from __future__ import annotations
