@@ -25,7 +25,7 @@ def sprint() -> tuple[PhysicsState, Tensor]:
     env.age[:] = 0
     qpos, qvel, targets = [], [], []
     running = torch.ones(WORLDS, dtype=torch.bool)
-    for t in range(MOMENTS[-1] + STEPS):
+    for _ in range(MOMENTS[-1] + STEPS):
         qpos.append(physics.qpos.clone())
         qvel.append(physics.qvel.clone())
         action = policy(obs).clamp(-1.0, 1.0)
