@@ -56,9 +56,9 @@ class TrainConfig:
     timestep_divisor: int = 1
     """2 halves the physics time step at the same control rate."""
     vary: bool = False
-    """Let the worlds differ in friction, gains and contact softness and, with
-    ``timestep_divisor`` 2, half of them run at the full time step: a policy that must hold in
-    every engine needs it."""
+    """Let the worlds differ in friction, gains and contact softness and, with a
+    ``timestep_divisor`` of 2 or 4, in time step: half of them take longer ones, up to the full
+    step. A policy that must hold in every engine needs it."""
     init: str | None = None
     """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]."""
     clips: tuple[Path, ...] = ()

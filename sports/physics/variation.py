@@ -1,10 +1,9 @@
 """Worlds that differ a little, so that a policy cannot live on one engine's numbers.
 
 Violent motion on the ground depends on the time step of every engine: a policy trained on one
-world alone won 91 % of its long jumps at 1/120 s and none at 1/240 s or in Drake; one that had seen
-half the step and a narrow range of contacts cleared the high bar at 1/120, 1/240 and 1/480 s but
-fell in Drake within 1 s (measured). In training each world may have its own friction, gains,
-contact softness and damping, and time step; the ranges reach from MuJoCo's ground past Drake's.
+world alone won 91 % of its long jumps at 1/120 s and none at 1/240 s or in Drake (measured, on
+MuJoCo's default ground). In training each world may have its own friction, gains, contact softness,
+damping and impedance, and time step.
 """
 
 from __future__ import annotations
@@ -17,6 +16,8 @@ from sports.humanoid.mjcf import CONTACT_SOLREF
 
 _RANGES = ("friction", "stiffness", "damping", "contact_time", "contact_damping")
 _RANGES += ("contact_impedance",)
+LEAST_SUBSTEPS = 4
+"""In a control step, of the coarsest worlds: the usual number."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,9 @@ class Variation:
     contact_impedance: tuple[float, float] = (0.4, 0.8)
     """Their impedance: the less, the more they yield to load."""
     coarse_share: float = 0.5
-    """Share of worlds that take two substeps in one, where the scene has an even number: with
-    ``timestep_divisor=2`` they run at the usual time step and the others at half of it."""
+    """Share of worlds that take several substeps in one: 2, 4, ... as often as leaves them
+    ``LEAST_SUBSTEPS``. With ``timestep_divisor=4`` these run at the usual time step or at half of
+    it, and the others at a quarter."""
 
     def __post_init__(self) -> None:
         for name in _RANGES:
@@ -59,13 +61,19 @@ class Draw:
     contact_time: np.ndarray
     contact_damping: np.ndarray
     contact_impedance: np.ndarray
-    coarse: np.ndarray
-    """bool"""
+    stride: np.ndarray
+    """int, substeps taken in one"""
+
+    def timesteps(self, timestep: float, substeps: int) -> list[np.ndarray] | None:
+        """(N,) time step of every substep: ``stride`` substeps in one, then none until the next;
+        None where all worlds take them one by one."""
+        if (self.stride == 1).all():
+            return None
+        return [np.where(i % self.stride == 0, self.stride * timestep, 0) for i in range(substeps)]
 
 
 def draw(variation: Variation, num_worlds: int, substeps: int, seed: int) -> Draw:
-    """One draw for each world. Coarse worlds need an even number of substeps: else there are
-    none."""
+    """One draw for each world of a scene with so many substeps in a control step."""
     rng = np.random.default_rng(seed)
 
     def uniform(span: tuple[float, float]) -> np.ndarray:
@@ -73,7 +81,9 @@ def draw(variation: Variation, num_worlds: int, substeps: int, seed: int) -> Dra
 
     values = [uniform(getattr(variation, name)) for name in _RANGES]
     coarse = rng.random(num_worlds) < variation.coarse_share
-    return Draw(*values, coarse=coarse & (substeps % 2 == 0) & (substeps > 4))
+    strides = [s for s in (2, 4, 8) if substeps % s == 0 and substeps // s >= LEAST_SUBSTEPS]
+    drawn = np.array(strides or [1])[rng.integers(len(strides or [1]), size=num_worlds)]
+    return Draw(*values, stride=np.where(coarse, drawn, 1))
 
 
 def contact_softness(

@@ -365,8 +365,8 @@ class WarpPhysics:
         self._step_graph = self._refresh_graph = None
 
     def _vary(self, drawn: Draw) -> None:
-        """Gives each world its own numbers. A coarse world takes two time steps at once, then
-        one of length zero, which changes nothing."""
+        """Gives each world its own numbers. A coarse world takes several time steps at once, then
+        some of length zero, which change nothing."""
         model, m, n = self.model, self.m, self.num_worlds
 
         def rows(values: np.ndarray) -> np.ndarray:
@@ -385,11 +385,9 @@ class WarpPhysics:
         m.actuator_biasprm = wp.array(bias, dtype=m.actuator_biasprm.dtype)
         damping = rows(model.dof_damping.reshape(model.nv, -1)[:, 0])
         m.dof_damping = wp.array(damping * drawn.damping[:, None].astype(np.float32), dtype=float)
-        if drawn.coarse.any():
-            h = self.scene.timestep
-            double = wp.array(np.where(drawn.coarse, 2 * h, h).astype(np.float32), dtype=float)
-            none = wp.array(np.where(drawn.coarse, 0.0, h).astype(np.float32), dtype=float)
-            self._timesteps = [none if i % 2 else double for i in range(self.scene.substeps)]
+        timesteps = drawn.timesteps(self.scene.timestep, self.scene.substeps)
+        if timesteps is not None:
+            self._timesteps = [wp.array(h.astype(np.float32), dtype=float) for h in timesteps]
 
     def _substeps(self) -> None:
         d = self.d

@@ -114,9 +114,6 @@ class Worlds:
         expand("actuator_biasprm")[:, :, 1] *= drawn.stiffness[:, None]
         damping = expand("dof_damping")
         damping *= drawn.damping.reshape(-1, *[1] * (damping.ndim - 1))
-        if drawn.coarse.any():
-            h = self.scene.timestep
+        self._timesteps = drawn.timesteps(self.scene.timestep, self.scene.substeps)
+        if self._timesteps is not None:
             self._timestep = expand("opt.timestep")
-            double = np.where(drawn.coarse, 2 * h, h)
-            none = np.where(drawn.coarse, 0.0, h)
-            self._timesteps = [none if i % 2 else double for i in range(self.scene.substeps)]

@@ -12,7 +12,7 @@ from sports.frames import Heading, proprioception
 from sports.humanoid import load_body
 from sports.humanoid.mjcf import build_model
 from sports.physics import Geometry, PhysicsState, default_state, make_physics
-from sports.physics.variation import Variation
+from sports.physics.variation import Variation, draw
 from sports.scene import Start, humanoid_scene
 
 
@@ -302,7 +302,7 @@ def test_a_broken_world_is_counted_reset_and_alone():
 
 def test_worlds_that_vary_are_the_same_on_both_engines():
     pytest.importorskip("mujoco_warp")
-    scene = make_scene("long_jump", timestep_divisor=2)
+    scene = make_scene("long_jump", timestep_divisor=4)
     options = {"variation": Variation(), "variation_seed": 3}
     c = cpu(scene, 4, **options)
     w = make_physics("warp", scene, 4, device="cpu", **options)
@@ -316,23 +316,28 @@ def test_worlds_that_vary_are_the_same_on_both_engines():
 
 
 def test_a_coarse_world_is_a_plain_world():
-    """Two substeps in one, then one of length zero, against the usual time step. In the air, where
-    only the instant of the momentum's correction differs."""
-    neutral = Variation((1, 1), (1, 1), (1, 1), (0.02, 0.02), (1, 1), coarse_share=1.0)
-    fine = make_scene("long_jump", timestep_divisor=2)
-    varied = cpu(fine, 2, variation=neutral)
-    plain = cpu(make_scene("long_jump"), 2)
-    for physics in (varied, plain):
-        state = default_state(fine, 2, "cpu")
+    """Several substeps in one, then some of length zero, against worlds that all have that time
+    step. In the air, where only the instant of the momentum's correction differs."""
+    neutral = Variation((1, 1), (1, 1), (1, 1), coarse_share=0.7)
+    n = 6
+    fine = make_scene("long_jump", timestep_divisor=4)
+    strides = draw(neutral, n, fine.substeps, 4).stride
+    assert set(strides.tolist()) == {1, 2, 4}
+    varied = cpu(fine, n, variation=neutral, variation_seed=4)
+    plain = {s: cpu(make_scene("long_jump", timestep_divisor=4 // s), n) for s in (1, 2, 4)}
+    for physics in (varied, *plain.values()):
+        state = default_state(fine, n, "cpu")
         state.qpos[:, 2] += 3.0
-        physics.reset(torch.tensor([True, True]), state)
+        physics.reset(torch.ones(n, dtype=torch.bool), state)
     generator = torch.Generator().manual_seed(0)
     for _ in range(8):
-        ctrl = 0.2 * torch.randn(2, fine.nu, generator=generator)
-        varied.step(ctrl)
-        plain.step(ctrl)
-    assert (varied.qpos - plain.qpos).abs().max() < 2e-3
-    assert (varied.qpos[:, :3] - plain.qpos[:, :3]).abs().max() < 1e-4
+        ctrl = (0.2 * torch.randn(fine.nu, generator=generator)).expand(n, -1)
+        for physics in (varied, *plain.values()):
+            physics.step(ctrl)
+    apart = (plain[1].qpos - plain[4].qpos).abs().max()
+    for stride, physics in plain.items():
+        off = (varied.qpos - physics.qpos)[torch.tensor(strides == stride)].abs()
+        assert off.max() < 2e-3 and off[:, :3].max() < 1e-4 and off.max() < 0.2 * apart
     with pytest.raises(ValueError, match="friction must be 0 < low <= high"):
         Variation(friction=(1.0, 0.5))
 
