@@ -626,14 +626,28 @@ def look_at_contacts(
 
 @compiled
 def place_points(
-    points: np.ndarray, owners: np.ndarray, pos: np.ndarray, turn: np.ndarray, out: np.ndarray
+    points: np.ndarray,
+    owners: np.ndarray,
+    axis: int,
+    pos: np.ndarray,
+    rot: np.ndarray,
+    out: np.ndarray,
 ) -> None:
-    """Writes one world coordinate of points (K, 3) of links ``owners`` (K,) to (K, N), from that
-    of the links' origins (B, N) and that row of their R_WB (3, B, N)."""
+    """Writes the coordinate of points (K, 3) along a world axis to (K, N).
+
+    ``owners`` (K,) their links, rising; ``pos`` (N, B, 3) and ``rot`` (N, B, 3, 3) of the links.
+    """
+    near, link = np.empty((4, out.shape[1]), np.float32), -1
     for k in range(len(points)):
-        i, x, y, z = owners[k], points[k, 0], points[k, 1], points[k, 2]
+        if owners[k] != link:
+            link = owners[k]
+            for w in range(out.shape[1]):
+                near[0, w] = pos[w, link, axis]
+                for j in range(3):
+                    near[1 + j, w] = rot[w, link, axis, j]
+        x, y, z = points[k]
         for w in range(out.shape[1]):
-            out[k, w] = pos[i, w] + turn[0, i, w] * x + turn[1, i, w] * y + turn[2, i, w] * z
+            out[k, w] = near[0, w] + near[1, w] * x + near[2, w] * y + near[3, w] * z
 
 
 @compiled
@@ -644,3 +658,11 @@ def least_of_links(owners: np.ndarray, values: np.ndarray, out: np.ndarray) -> N
         i = owners[k]
         for w in range(out.shape[1]):
             out[i, w] = min(out[i, w], values[k, w])
+
+
+@compiled
+def copy_worlds(rows: np.ndarray, worlds: np.ndarray, columns: np.ndarray) -> None:
+    """Makes some columns of (k, N), by index, those rows of (N, k)."""
+    for j in range(len(columns)):
+        for w in worlds:
+            columns[j, w] = rows[w, j]

@@ -63,7 +63,7 @@ class MujocoPhysics:
     def step(self, ctrl: Tensor) -> None:
         self._worlds.step(ctrl.numpy())
         self.bad = torch.from_numpy(self._out.bad.copy())
-        if self.bad.any():
+        if self._out.bad.any():
             self.nan_worlds += int(self.bad.sum())
             safe = default_state(self.scene, self.num_worlds, self.device)
             safe.mocap_pos = self.mocap_pos.clone()

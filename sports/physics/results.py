@@ -16,7 +16,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sports.physics.athletes import Athlete, Tree, show_athlete, show_numbers, show_object
+from sports.physics.athletes import (
+    Athlete,
+    Tree,
+    copy_worlds,
+    show_athlete,
+    show_numbers,
+    show_object,
+)
 from sports.physics.base import SPEED_LIMIT, Geometry
 from sports.scene import Scene
 
@@ -91,7 +98,7 @@ class Results:
 
     def put(self, worlds: np.ndarray, source: Results) -> None:
         """Makes worlds, by index, those of other results that do not change any more."""
-        self._all[:, worlds] = source.by_world[worlds].T
+        copy_worlds(source.by_world, worlds, self._all)
         self.felt[worlds] = source.felt[worlds]
 
     def athlete(self, agent: int) -> Athlete:

@@ -25,9 +25,7 @@ class CompiledGeometry(Geometry):
 
     def link_points(self, body_pos: Tensor, rotation: Tensor, axis: int) -> Tensor:
         out = torch.empty(len(self.points), len(body_pos))
-        pos, turn = body_pos[:, :, axis].T, rotation[:, :, axis].permute(2, 1, 0)
-        near = pos.contiguous().numpy(), turn.contiguous().numpy()
-        place_points(*self._table, *near, out.numpy())
+        place_points(*self._table, axis, body_pos.numpy(), rotation.numpy(), out.numpy())
         return out.T
 
     def least(self, values: Tensor) -> Tensor:
