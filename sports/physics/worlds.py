@@ -1,4 +1,4 @@
-"""The worlds of the ``mujoco`` engine in numpy: a batch of C MuJoCo and what is done around it.
+"""The worlds of the ``mujoco`` engine: a batch of C MuJoCo and what is done around it.
 
 A control step is ``substeps`` calls of the batch, the momentum kept after each.
 """
