@@ -47,7 +47,7 @@ class Tracking:
     """Control steps looked ahead."""
     knot_every: int = 3
     """Control steps between the knots of a random spline."""
-    iterations: int = 2
+    iterations: int = 4
     """Rounds of sampling per control step."""
     after: int = 12
     """Control steps planned beyond the reference where a task decides its outcome there: the
