@@ -47,7 +47,7 @@ class Tracking:
     """Control steps looked ahead."""
     knot_every: int = 3
     """Control steps between the knots of a random spline."""
-    iterations: int = 2
+    iterations: int = 4
     """Rounds of sampling per control step."""
     after: int = 12
     """Control steps planned beyond the reference where a task decides its outcome there: the
@@ -211,8 +211,8 @@ def track_best(
     progress: Callable[[int, int], None] | None = None,
 ) -> Tracked:
     """Tracks in the task's scene until the task calls it a success with the outcome that was asked
-    for, up to ``ENOUGH``; else the best of all ``attempts``: a success, then the outcome, then the
-    error of the links.
+    for, up to ``ENOUGH``, that does not touch the bar; else the best of all ``attempts``: a
+    success, then the outcome, then a bar that was not touched, then the error of the links.
 
     Each attempt draws other noise, the later ones more of it. Raises ValueError for a reference
     whose problem is no task, RuntimeError when every attempt diverged.
@@ -235,7 +235,7 @@ def track_best(
             continue
         if best is None or _rank(found) > _rank(best):
             best = found
-        if best.success and _share(best) >= ENOUGH:
+        if best.success and _share(best) >= ENOUGH and _clear(best):
             return best
     if best is None:
         raise RuntimeError(f"none of {attempts} attempts could be simulated: {reason}")
@@ -250,8 +250,13 @@ def _share(tracked: Tracked) -> float:
     return min(achieved / asked, 1.0) if asked and achieved else 1.0
 
 
-def _rank(tracked: Tracked) -> tuple[bool, float, float]:
-    return tracked.success, _share(tracked), -tracked.link_error
+def _clear(tracked: Tracked) -> bool:
+    """Whether the athlete passed over the bar without touching it; true where there is none."""
+    return tracked.clip.meta["achieved"].get("clearance", 0.0) >= 0.0
+
+
+def _rank(tracked: Tracked) -> tuple[bool, float, bool, float]:
+    return tracked.success, _share(tracked), _clear(tracked), -tracked.link_error
 
 
 def _reference(clip: Clip, worlds: _Worlds) -> Reference:

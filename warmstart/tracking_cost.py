@@ -35,7 +35,7 @@ class Weights:
     """Per squared share of the servo's range by which targets leave the reference's."""
     bar: float = 1000.0
     """Per m by which the bar has moved, and per 10 m/s at which it moves."""
-    foul: float = 400.0
+    foul: float = 2000.0
     """Per m by which a contact before the take-off lies beyond the line."""
     mark: float = 100.0
     """Per m by which a contact after the landing lies behind the asked mark."""

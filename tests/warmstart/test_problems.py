@@ -201,6 +201,31 @@ def test_infeasible_names_the_limiting_joint():
     jumper.check(_result(x), "a bar at 2 m", lambda: pytest.fail("not asked"))
 
 
+@pytest.mark.parametrize("stuck", [None, 1.25])
+def test_a_high_bar_is_reached_from_lower_ones(jump, monkeypatch, stuck):
+    """Each bar starts from the one below; a step that fails leaves the last one that did not."""
+    bars: list[tuple[float, bool]] = []
+
+    def run(program, start, parameters, neighbour, *rest) -> Result:
+        height = round(parameters[0] - config.clearance, 6)
+        bars.append((height, neighbour))
+        return _result(start, violation=1.0 if height == stuck else 0.0)
+
+    monkeypatch.setattr(jumper, "run", run)
+    config = high_jump.Config(bar_height=1.33, detail=0.3)
+    solution = high_jump.solve(config)
+    below = [1.2, 1.25] if stuck else [1.2, 1.25, 1.3]
+    assert bars == [(height, height > 1.2) for height in (*below, 1.33)]
+    assert solution.asked == {"bar_height": 1.33}
+    assert solution.stats["iterations"] == 3 * len(bars) and solution.stats["solve_s"] == len(bars)
+    bars.clear()
+    high_jump.solve(config, guess=jump)
+    assert bars == [(1.33, True)]
+    bars.clear()
+    high_jump.solve(high_jump.Config(bar_height=1.2, detail=0.3))
+    assert bars == [(1.2, False)]
+
+
 @pytest.mark.slow
 def test_a_bar_that_nobody_clears_is_infeasible_and_says_why():
     """Solved for real: neither the strength of a human nor four times it is found to do."""

@@ -9,8 +9,9 @@ between two knots.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -27,6 +28,11 @@ from warmstart.transcription import Transcription
 BAR_X, LANE_Y = 20.0, 6.0
 _PARABOLA = 8.0
 """Curvature (1/m) of the keep-out parabola; up to 1 / (2 radius) = 20 would contain the bar."""
+EASY, RAISE = 1.2, 0.05
+"""A bar above EASY (m) is reached from there, raised by RAISE (m) at a time: from key poses the
+solver finds no way over 1.5 m at strength human."""
+_ROUGH = {"ipopt.tol": 1e-2, "ipopt.dual_inf_tol": 10.0, "ipopt.compl_inf_tol": 1e-2}
+"""Optimality of the jumps on the way up; they are as feasible as the last one."""
 _COVERED = ("Neck", "Thorax", "Wrist", "Spine")
 """Links whose balls lie inside the hull of their neighbours."""
 _TRUNK = ("Chest", "Head", "L_Shoulder", "R_Shoulder")
@@ -156,24 +162,54 @@ def first_guess(program: Transcription, bar_height: float) -> np.ndarray:
     return program.guess(q, durations)
 
 
+def lower_bars(bar_height: float) -> list[float]:
+    """Heights (m) on the way up to a bar, lowest first; none for a bar that is easy."""
+    count = math.ceil(round((bar_height - EASY) / RAISE, 6))
+    return [round(EASY + RAISE * i, 6) for i in range(count)]
+
+
 def solve(
     config: Config,
     guess: Solution | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> Solution:
-    """The least-effort jump over the bar. See :meth:`warmstart.problems.Problem.solve`."""
+    """The least-effort jump over the bar. See :meth:`warmstart.problems.Problem.solve`.
 
-    def attempt(elastic: bool) -> tuple[Transcription, Result]:
+    The iterations and times in its stats include those of the lower bars on the way up.
+    """
+    results: list[Result] = []
+
+    def attempt(
+        config: Config, guess: Solution | None, elastic: bool = False, rough: bool = False
+    ) -> tuple[Transcription, Result]:
         program = transcribe(config, elastic)
         start = (
             first_guess(program, config.bar_height) if guess is None else program.guess_from(guess)
         )
-        parameters = [config.bar_height + config.clearance]
-        return program, jumper.run(
-            program, start, parameters, guess is not None, progress, config.max_iterations
+        result = jumper.run(
+            program,
+            start,
+            [config.bar_height + config.clearance],
+            guess is not None,
+            progress,
+            config.max_iterations,
+            _ROUGH if rough else None,
         )
+        results.append(result)
+        return program, result
 
-    program, result = attempt(False)
+    for height in lower_bars(config.bar_height) if guess is None else ():
+        program, result = attempt(replace(config, bar_height=height), guess, rough=True)
+        if not jumper.solved(result):
+            break
+        guess = program.solution("high_jump", {"bar_height": height}, result)
+    program, result = attempt(config, guess)
     what = f"a bar at {config.bar_height:g} m"
-    jumper.check(result, what, lambda: attempt(True))
-    return program.solution("high_jump", {"bar_height": config.bar_height}, result)
+    jumper.check(result, what, lambda: attempt(config, guess, elastic=True))
+    total = replace(
+        result,
+        iterations=sum(r.iterations for r in results),
+        solve_s=sum(r.solve_s for r in results),
+        cpu_s=sum(r.cpu_s for r in results),
+    )
+    return program.solution("high_jump", {"bar_height": config.bar_height}, total)

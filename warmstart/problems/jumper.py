@@ -293,9 +293,14 @@ NEARLY = 1e-3
 """An elastic program below this violation tells which torque limits are short."""
 
 
+def solved(result: Result) -> bool:
+    """Whether the solver found an optimum, or an acceptable one, within ``VIOLATION``."""
+    return result.max_violation < VIOLATION and (result.success or "Acceptable" in result.status)
+
+
 def check(result: Result, what: str, elastic: Callable[[], tuple[Transcription, Result]]) -> None:
     """Raises Infeasible naming what stands in the way, found by stretching torque limits."""
-    if result.max_violation < VIOLATION and (result.success or "Acceptable" in result.status):
+    if solved(result):
         return
     program, relaxed = elastic()
     strength = program.body.strength
