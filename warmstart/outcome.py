@@ -19,7 +19,7 @@ from sports.physics.base import Geometry
 from warmstart import rotation
 
 TOUCH = 0.005
-"""A support point this close to the ground (m) touches it: twice the sink of a landing foot."""
+"""A support point this close to the ground (m) touches it; one that carries load has sunk in."""
 FLIGHT = 0.005
 """Without a support point below this height (m) the athlete flies."""
 
