@@ -228,7 +228,8 @@ def solution_plots(solution: Solution) -> Plots:
     """Height, speed, ground force and effort of an optimised motion over time."""
     from olympics_opt.report.page import Plots
     from olympics_opt.report.plots import Plot, Series
-    from olympics_opt.report.sections import GRAVITY, body_plots
+    from olympics_opt.report.sections import body_plots
+    from sports.physics.base import GRAVITY
 
     time = solution.times - solution.times[0]
     weight = solution.body.mass * GRAVITY

@@ -11,7 +11,8 @@ from typing import Any
 
 from torch import Tensor
 
-GRAVITY = 9.81
+from sports.physics.base import GRAVITY
+
 MOST = 30.0
 """Body weights counted for one link: beyond, an impact is as bad as it can be."""
 

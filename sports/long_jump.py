@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from sports.humanoid.body import Body
-from sports.physics.base import PhysicsState
+from sports.physics.base import GRAVITY, PhysicsState
 from sports.scene import Scene
 from sports.task import Advance, Memory, Task, View, clamp01, constant, nan_where, progress
 from sports.task import length as magnitude
@@ -30,7 +30,6 @@ MARK_STEPS = 9
 """Steps after the landing step in which marks count."""
 TOUCH = 1e-3
 """A support point this close to the ground (m) leaves a mark."""
-GRAVITY = 9.81
 
 
 @dataclass(frozen=True)

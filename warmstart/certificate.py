@@ -28,6 +28,7 @@ import mujoco
 import numpy as np
 
 from sports.humanoid.mjcf import body_name, build_model
+from sports.physics.base import GRAVITY
 from sports.scene import humanoid_scene
 from warmstart.atomic import write_text
 from warmstart.inverse_dynamics import inverse_dynamics_drake, inverse_dynamics_mujoco
@@ -37,7 +38,6 @@ from warmstart.solution import Solution
 
 FINER = 5
 """Samples per interval of the optimiser."""
-GRAVITY = 9.81
 LOADED = 0.01
 """A contact point counts as loaded from this share of body weight on."""
 

@@ -23,8 +23,8 @@ import casadi as ca
 import numpy as np
 
 from sports.humanoid.body import Body
+from sports.physics.base import GRAVITY
 
-GRAVITY = 9.81
 ROOT_COORDINATES = ("x", "y", "z", "pitch", "roll", "yaw")
 _ROOT_AXES = (1, 0, 2)
 _UNIT = np.eye(3)

@@ -26,6 +26,7 @@ from pydrake.solvers import (
     SolverOptions,
 )
 
+from sports.physics.base import GRAVITY
 from warmstart.contact import sole_points
 from warmstart.problems.jumper import HELD_LIMITS, POSITION, RATE, boxes
 from warmstart.reduced_plant import ReducedPlant
@@ -105,7 +106,7 @@ class StanceProgram:
         self.f_ref = solution.contact_force[keep]
         self.times = solution.times[keep]
         self.K = len(self.times)
-        self.weight = self.model.mass * 9.81
+        self.weight = self.model.mass * GRAVITY
         self.share = self.bounds.torque_share
         self._build()
 

@@ -20,10 +20,11 @@ import casadi as ca
 import numpy as np
 
 from sports.humanoid.body import Body
+from sports.physics.base import GRAVITY
 from warmstart.contact import Ball, sole_points
 from warmstart.nlp import Program, Result
 from warmstart.phases import ELASTIC_PRICE, ELASTIC_REACH, MODES, Bounds, Phase, Weights
-from warmstart.rigid_body import GRAVITY, ReducedModel, from_full_state, to_full_state
+from warmstart.rigid_body import ReducedModel, from_full_state, to_full_state
 from warmstart.solution import Solution
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from olympics_opt.report.page import Plots, Section, Table, Text, Tile, Tiles, Tone, number
 from olympics_opt.report.plots import Plot, Series, ecdf
+from sports.physics.base import GRAVITY
 
-GRAVITY = 9.81
 ENGINE_NAMES = {
     "mujoco": "MuJoCo",
     "warp": "MuJoCo Warp",

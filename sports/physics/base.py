@@ -224,8 +224,8 @@ class Geometry:
         return (body_pos * direction).sum(-1) + reach.amax(-1)
 
 
-GRAVITY = np.array((0.0, 0.0, -9.81))
-"""m/s^2"""
+GRAVITY = 9.81
+"""m/s^2, along -z"""
 NO_FORCE = 0.1
 """A root force (N, N m) below this is rounding of self-contacts: the athlete touches nothing."""
 SPEED_LIMIT = 2000.0

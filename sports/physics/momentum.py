@@ -81,7 +81,7 @@ class AthleteKeeper:
             expected=np.full((num, 9), np.nan),
             timestep=np.full(num, model.opt.timestep),
             mass=mass,
-            weight=float(mass * GRAVITY[2]),
+            weight=-mass * GRAVITY,
             no_force=NO_FORCE,
         )
         """The momentum and the path expected of the state measured next; the time step of each

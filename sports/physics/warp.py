@@ -134,7 +134,7 @@ def _keep_momentum(
     local = wp.vec3(qfrc_constraint[w, v + 3], qfrc_constraint[w, v + 4], qfrc_constraint[w, v + 5])
     flying = wp.length(force) + wp.length(local) < wp.static(NO_FORCE)
     impulse_l = h * (turn @ local + wp.cross(arm, force))
-    impulse_p = h * (force + wp.vec3(0.0, 0.0, wp.static(float(GRAVITY[2])) * mass))
+    impulse_p = h * (force + wp.vec3(0.0, 0.0, wp.static(-GRAVITY) * mass))
 
     error_l = wp.vec3(0.0, 0.0, 0.0)
     error_p = wp.vec3(0.0, 0.0, 0.0)
