@@ -10,9 +10,10 @@ again and again, on the same worlds, and compared within each turn:
 * training: whole PPO iterations, rollout and update.
 
 Actions are what a fresh policy samples: normal, sigma 0.12. Nothing resets bare physics, and worlds
-that have fallen are slower, so it takes over the environment's states as the environment goes on:
-before every control step on a CPU, so that both take the same step from the same states; before
-every eighth on a GPU, where stopping the clock costs time.
+that have fallen are slower, so it goes along the states that the environment went through: put
+there before every control step on a CPU, so that both take the same steps; before every eighth on a
+GPU, where stopping the clock costs time. Each goes through all of them in a row: taking turns step
+by step would empty the processor's caches before every step, as no loop of either does.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ WORLDS = {"mujoco": 256, "warp": 8192, "drake": 4}
 STEPS = 24
 """Control steps of one measurement: a rollout of the trainer."""
 RELOAD = {"cpu": 1, "cuda": 8}
-"""Bare physics takes over the environment's states after so many control steps."""
+"""Bare physics is put into the environment's states after so many control steps."""
 SIGMA = PPOConfig().sigma
 
 
@@ -105,23 +106,28 @@ class Meter:
             self._rollout = self.agent.new_rollout(env.num_worlds * env.num_agents)
 
     def pair(self) -> dict[str, float]:
-        """Control steps per second of ``bare_physics`` and of the ``environment`` under random
-        actions, in turn along one trajectory of the environment."""
+        """Control steps per second of the ``environment`` under random actions, and of
+        ``bare_physics`` along its states."""
         env, every = self.env, RELOAD[self.env.device.type]
+        picks = [i % len(self._actions) for i in range(self.steps)]
+        blocks = [picks[start : start + every] for start in range(0, self.steps, every)]
         bare = environment = 0.0
+        trail = []
         with _torch_threads(env):
-            for start in range(0, self.steps, every):
-                picks = [i % len(self._actions) for i in range(start, start + every)]
-                self._bare.take_over()
+            for block in blocks:
+                trail.append(self._bare.save())
                 with self._timed() as elapsed:
-                    for i in picks:
-                        self._bare.step(self._controls[i])
-                bare += elapsed[0]
-                self._bare.give_back()
-                with self._timed() as elapsed:
-                    for i in picks:
+                    for i in block:
                         self._obs = env.step(self._actions[i]).obs
                 environment += elapsed[0]
+            end = self._bare.save()
+            for block, state in zip(blocks, trail):
+                self._bare.load(state)
+                with self._timed() as elapsed:
+                    for i in block:
+                        self._bare.step(self._controls[i])
+                bare += elapsed[0]
+            self._bare.load(end)
         count = env.num_worlds * self.steps
         return {"bare_physics": count / bare, "environment": count / environment}
 
@@ -164,18 +170,11 @@ def _torch_threads(env: Env) -> Iterator[None]:
 
 
 class _Borrowed:
-    """Bare physics on the environment's own engine, which gets its state back afterwards."""
+    """Bare physics on the environment's own engine, to be given its state back afterwards."""
 
     def __init__(self, env: Env, step: Callable[[Tensor], None]) -> None:
         """``step``: a control step of the engine alone, from targets (N, nu)."""
-        self.step, self._env = step, env
-        self._state: dict[str, Tensor] = {}
-
-    def take_over(self) -> None:
-        self._state = self._env.state_dict()
-
-    def give_back(self) -> None:
-        self._env.load_state_dict(self._state)
+        self.step, self.save, self.load = step, env.state_dict, env.load_state_dict
 
 
 class _BareMujoco:
@@ -187,22 +186,22 @@ class _BareMujoco:
         self._physics = physics
         self.batch = Batch(physics.model, nsim=physics.num_worlds, nthread=physics.threads)
 
-    def take_over(self) -> None:
-        """Makes it the environment's present states, solver warm starts and movable fixtures."""
+    def save(self) -> dict[str, Tensor]:
+        """The environment's present states, solver warm starts and movable fixtures."""
         physics = self._physics
-        for name, value in physics.extra_state().items():
-            if name in ("qpos", "qvel", "qacc_warmstart"):
-                self.batch.bind(name)[:] = value.numpy()
-        for k, o in enumerate(physics.scene.mocap_objects):
-            row = physics.model.body(o.name).mocapid[0]
-            self.batch.bind("mocap_pos")[:, row] = physics.mocap_pos[:, k].numpy()
+        return physics.extra_state() | {"mocap_pos": physics.mocap_pos.clone()}
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Makes them those of the batch."""
+        for name in ("qpos", "qvel", "qacc_warmstart"):
+            self.batch.bind(name)[:] = state[name].numpy()
+        for k, o in enumerate(self._physics.scene.mocap_objects):
+            row = self._physics.model.body(o.name).mocapid[0]
+            self.batch.bind("mocap_pos")[:, row] = state["mocap_pos"][:, k].numpy()
 
     def step(self, targets: Tensor) -> None:
         self.batch.bind("ctrl")[:] = targets.numpy()
         self.batch.step(nstep=self._physics.scene.substeps)
-
-    def give_back(self) -> None:
-        """Nothing was taken."""
 
 
 def _bare(env: Env) -> _Borrowed | _BareMujoco:

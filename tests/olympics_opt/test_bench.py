@@ -30,37 +30,39 @@ def meter():
 
 
 def test_bare_physics_and_environment_take_the_same_steps(meter: Meter) -> None:
-    """Both go as far as they report, bare physics each time from the environment's states."""
+    """Both go as far as they report, bare physics each time from a state of the environment."""
     env, bare = meter.env, meter._bare
     period = env.physics.scene.control_timestep
     time, qpos = bare.batch.bind("time"), bare.batch.bind("qpos")
     stepped, env_step = bare.step, env.step
     taken, steps = 0.0, 0
-
-    def counted(targets: torch.Tensor) -> None:
-        nonlocal taken
-        before = time.copy()
-        np.testing.assert_array_equal(qpos, env.physics.extra_state()["qpos"].numpy())
-        stepped(targets)
-        taken += float((time - before).sum())
+    went: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # before, after, not ended
 
     def counted_env(action: torch.Tensor):
-        nonlocal steps
-        steps += 1
-        clock = env.view.clock.clone()
+        before, clock = env.physics.extra_state()["qpos"].numpy(), env.view.clock.clone()
         result = env_step(action)
         ended = result.terminated | result.truncated | ~result.valid
         assert (env.view.clock == torch.where(ended, 0, clock + 1)).all()
-        # Without contacts that differ and momentum that drifts both have gone the same way.
-        far = np.abs(qpos - env.physics.extra_state()["qpos"].numpy())[~ended.numpy()]
-        assert far.max() < 0.05
+        went.append((before, env.physics.extra_state()["qpos"].numpy(), ~ended.numpy()))
         return result
+
+    def counted(targets: torch.Tensor) -> None:
+        nonlocal taken, steps
+        before, after, goes_on = went[steps]
+        steps += 1
+        clock = time.copy()
+        np.testing.assert_array_equal(qpos, before)
+        stepped(targets)
+        taken += float((time - clock).sum())
+        # Without contacts that differ and momentum that drifts both have gone the same way.
+        assert np.abs(qpos - after)[goes_on].max() < 0.05
 
     bare.step, env.step = counted, counted_env
     rates = meter.pair()
     # 12 blocks of one control step, one second of our clock each.
     assert rates == {"bare_physics": pytest.approx(4), "environment": pytest.approx(4)}
-    assert taken == pytest.approx(4 * 12 * period) and steps == 12
+    assert taken == pytest.approx(4 * 12 * period) and steps == len(went) == 12
+    np.testing.assert_array_equal(went[-1][1], env.physics.extra_state()["qpos"].numpy())
 
 
 def plain_mujoco(physics, qpos, qvel, controls: torch.Tensor) -> torch.Tensor:
@@ -84,7 +86,7 @@ def test_bare_physics_is_mujoco_and_nothing_else(meter: Meter) -> None:
     assert bare.batch.nthread == env.physics.threads == 2
     state, controls = env.physics.extra_state(), meter._controls[0]
     want = plain_mujoco(env.physics, state["qpos"], state["qvel"], controls)
-    bare.take_over()
+    bare.load(bare.save())
     bare.step(controls)
     got = torch.from_numpy(bare.batch.bind("qpos").copy()).float()
     assert torch.allclose(got, want, atol=1e-6)
@@ -164,11 +166,10 @@ def test_bare_warp_is_mujoco() -> None:
         env.load_state_dict(env.state_dict())  # making the meter has stepped the engine
         want = plain_mujoco(env.physics, qpos, qvel, meter._controls[0])
         before = env.state_dict()
-        meter._bare.take_over()
         meter._bare.step(meter._controls[0])
         assert torch.allclose(env.physics.qpos, want, atol=1e-5)
         assert not torch.allclose(want, qpos, atol=1e-3)
-        meter._bare.give_back()
+        meter._bare.load(before)
         for name, value in env.state_dict().items():
             torch.testing.assert_close(value, before[name], rtol=0, atol=0, equal_nan=True)
     finally:
