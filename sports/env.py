@@ -144,12 +144,14 @@ class Env:
 
         step = self.task.advance(self.view, self.memory)
         self.memory = step.memory
-        bad = self.physics.bad
-        terms = {k: v.masked_fill(bad[:, None], 0.0) for k, v in step.terms.items()}
+        bad, valid = self.physics.bad, ~self.physics.bad
+        lost = bad[:, None]
+        terms = {k: v.masked_fill(lost, 0.0) for k, v in step.terms.items()}
         reward = reduce(torch.add, terms.values())
-        terminated = step.terminated & ~bad
-        truncated = (self.age >= self.max_steps) & ~terminated & ~bad
-        ended = terminated | truncated | bad
+        terminated = step.terminated & valid
+        truncated = (self.age >= self.max_steps) & valid & ~terminated
+        over = terminated | truncated
+        ended = over | bad
         final_obs = self._observe()
         if self.keep_snapshot:
             self.final_snapshot = self.snapshot()
@@ -158,8 +160,7 @@ class Env:
             left = (self.max_steps - self.view.clock).clamp(min=0).float()
             remaining = torch.where(step.remaining_paid & terminated, left, remaining)
         if self.task.promote is not None:
-            ended_well = (terminated | truncated) & ~bad
-            self.view.curriculum = self.task.promote(self.view, self.memory, step, ended_well)
+            self.view.curriculum = self.task.promote(self.view, self.memory, step, over)
 
         if self._stocks:
             # On a CPU, asking which worlds ended costs nothing and saves the work.
@@ -175,7 +176,7 @@ class Env:
             terms=terms,
             terminated=terminated,
             truncated=truncated,
-            valid=~bad,
+            valid=valid,
             remaining_paid=remaining,
             metrics=step.metrics,
         )

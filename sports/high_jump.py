@@ -184,25 +184,19 @@ def begin(view: View, context: Memory) -> Memory:
 def features(view: View, memory: Memory) -> dict[str, Tensor]:
     """Bar and goal as seen from the athlete (6)."""
     root = view.root_pos
-    bar = torch.stack(
-        (
-            torch.full_like(memory["bar_height"], BAR_X),
-            torch.full_like(memory["bar_height"], BAR_Y),
-            memory["bar_height"] - BAR_RADIUS,
-        ),
-        dim=-1,
-    )
-    return {
-        "bar": view.heading.local(bar[:, None] - root),
-        "goal": view.heading.local(_goal(root) - root),
-    }
+    marks = constant((BAR_X, BAR_Y, -BAR_RADIUS, *GOAL), root.device).view(2, 3)
+    rises = constant((0.0, 0.0, 1.0, 0.0, 0.0, 0.0), root.device).view(2, 3)
+    marks = torch.addcmul(marks, memory["bar_height"][:, None, None], rises)  # (N, 2, 3)
+    bar, goal = view.heading.local(marks[:, None] - root[:, :, None]).unbind(2)
+    return {"bar": bar, "goal": goal}
 
 
 def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
     root, before = view.root_pos[:, 0], memory["root"]
-    goal = _goal(root)
-    x, z = root[:, 0], root[:, 2]
+    goal = constant(GOAL, root.device)
+    x, y, z = root.unbind(-1)
+    before_x = before[:, 0]
     height = memory["bar_height"]
 
     gained = (x - memory["x_max"]).clamp(min=0.0)
@@ -214,21 +208,21 @@ def advance(view: View, memory: Memory) -> Advance:
     }
 
     # Crossing the plane of the bar, interpolated within the step.
-    crosses = (before[:, 0] < BAR_X) & (x >= BAR_X)
-    along = ((BAR_X - before[:, 0]) / (x - before[:, 0]).clamp(min=1e-6)).clamp(0.0, 1.0)
-    at = before + along[:, None] * (root - before)
-    beside = (at[:, 1] - BAR_Y).abs() > HALF_GAP
-    wrong_side = crosses & (beside | (at[:, 2] < height))
+    crosses = (before_x < BAR_X) & (x >= BAR_X)
+    along = ((BAR_X - before_x) / (x - before_x).clamp(min=1e-6)).clamp(0.0, 1.0)
+    _, at_y, at_z = torch.lerp(before, root, along[:, None]).unbind(-1)
+    beside = (at_y - BAR_Y).abs() > HALF_GAP
+    wrong_side = crosses & (beside | (at_z < height))
 
     bar = view.physics.object_pos[:, 0]
     aside = bar - memory["bar_rest"]
-    shift = torch.hypot(aside[:, 0], aside[:, 1])
+    aside_x, aside_y, aside_z = aside.unbind(-1)
     displaced = (
-        (memory["bar_rest"][:, 2] - bar[:, 2] > MAX_DROP)
-        | (shift > MAX_SHIFT)
+        (aside_z < -MAX_DROP)
+        | (torch.hypot(aside_x, aside_y) > MAX_SHIFT)
         | (view.physics.pair_force[:, 0] > MAX_PUSH)
     )
-    outside = (root[:, 1] < -0.5) | (root[:, 1] > 8.0) | (x < -0.5)
+    outside = (y < -0.5) | (y > 8.0) | (x < -0.5)
     short = x < CLEARED_X
     slow = (approach < STALL_SPEED * view.control_timestep) & short
     stalled = (memory["stalled"] + 1) * slow
@@ -236,7 +230,8 @@ def advance(view: View, memory: Memory) -> Advance:
 
     beyond = view.physics.body_pos[:, 0, :, 0] > CLEARED_X
     touch = (view.touching()[:, 0] & beyond).any(-1) & (x > CLEARED_X)
-    landed = memory["landed"] + ((memory["landed"] > 0) | touch)
+    down = memory["landed"] > 0
+    landed = memory["landed"] + (down | touch)
     failed = displaced | wrong_side | outside | fell | (stalled >= STALL_STEPS)
     success = (landed > HOLD_STEPS) & ~failed
 
@@ -244,23 +239,24 @@ def advance(view: View, memory: Memory) -> Advance:
     near = (x - BAR_X).abs() < 0.1
     height_sum = memory["height_sum"] + z * near
     height_count = memory["height_count"] + near
-    crossing_z = torch.where(crosses, at[:, 2], memory["crossing_z"])
+    crossing_z = torch.where(crosses, at_z, memory["crossing_z"])
     # An arm that swings back over the bar's plane after the landing is not the jump.
-    low_now = _lowest_over_bar(view).masked_fill(memory["landed"] > 0, torch.inf)
+    low_now = _lowest_over_bar(view).masked_fill(down, torch.inf)
     lowest = torch.minimum(memory["lowest_over_bar"], low_now)
 
     mean_height = torch.where(height_count > 0, height_sum / height_count.clamp(min=1), crossing_z)
+    lost, success_share = ~success, success.float()
     metrics = {
-        "success": success.float(),
-        "height": nan_where(~success, mean_height),
-        "clearance": nan_where(~success | lowest.isinf(), lowest - height),
+        "success": success_share,
+        "height": nan_where(lost, mean_height),
+        "clearance": nan_where(lost | lowest.isinf(), lowest - height),
         "bar_height": height,
         "knocked": displaced.float(),
     }
-    for h in EVALUATION_HEIGHTS:
-        here = (height - h).abs() < 1e-4
-        metrics[f"success_{h}m"] = nan_where(~here, success.float())
-        metrics[f"height_{h}m"] = nan_where(~here, metrics["height"])
+    elsewhere = (height - constant(EVALUATION_HEIGHTS, height.device)[:, None]).abs() >= 1e-4
+    for name in ("success", "height"):
+        of_heights = nan_where(elsewhere, metrics[name].expand(elsewhere.shape)).unbind()
+        metrics |= {f"{name}_{h}m": v for h, v in zip(EVALUATION_HEIGHTS, of_heights)}
     memory = {
         **memory,
         "root": root.clone(),
@@ -279,10 +275,6 @@ def advance(view: View, memory: Memory) -> Advance:
         metrics=metrics,
         success=success,
     )
-
-
-def _goal(root: Tensor) -> Tensor:
-    return constant(GOAL, root.device)
 
 
 def _lowest_over_bar(view: View) -> Tensor:

@@ -87,7 +87,7 @@ def features(view: View, memory: Memory) -> dict[str, Tensor]:
 def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
     root = view.root_pos[:, 0]
-    x, y = root[:, 0], root[:, 1]
+    x, y, z = root.unbind(-1)
     goal = constant(GOAL, root.device)
     touched = view.touching()[:, 0]  # (N, B) in any substep
     geometry = view.geometry
@@ -129,7 +129,7 @@ def advance(view: View, memory: Memory) -> Advance:
     terms = {
         "progress": clamp01(progress(memory["root"], root, goal)),
         "speed": 0.01 * view.root_linvel[:, 0, 0],
-        "flight": 0.1 * root[:, 2] * flying,
+        "flight": 0.1 * z * flying,
         "length": (30.0 * length).masked_fill(~success, 0.0),
     }
 

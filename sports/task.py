@@ -158,7 +158,8 @@ def constant(values: tuple[float, ...], device: torch.device) -> Tensor:
 
 def progress(before: Tensor, now: Tensor, goal: Tensor) -> Tensor:
     """(...) metres gained on ``goal`` since the last step: d(before, goal) - d(now, goal)."""
-    return length(before - goal) - length(now - goal)
+    was, now = length(torch.stack((before, now)) - goal).unbind()
+    return was - now
 
 
 def squared(v: Tensor) -> Tensor:
