@@ -241,7 +241,8 @@ def advance(view: View, memory: Memory) -> Advance:
     height_count = memory["height_count"] + near
     crossing_z = torch.where(crosses, at_z, memory["crossing_z"])
     # An arm that swings back over the bar's plane after the landing is not the jump.
-    low_now = _lowest_over_bar(view).masked_fill(down, torch.inf)
+    links = view.physics.body_pos[:, 0], view.rotation[:, 0]
+    low_now = view.geometry.lowest_near(*links, BAR_X, 0.05).masked_fill(down, torch.inf)
     lowest = torch.minimum(memory["lowest_over_bar"], low_now)
 
     mean_height = torch.where(height_count > 0, height_sum / height_count.clamp(min=1), crossing_z)
@@ -275,17 +276,6 @@ def advance(view: View, memory: Memory) -> Advance:
         metrics=metrics,
         success=success,
     )
-
-
-def _lowest_over_bar(view: View) -> Tensor:
-    """(N,) z of the lowest body point within 5 cm of the bar's plane; inf if there is none."""
-    geometry = view.geometry
-    x, z = (
-        geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0], axis)
-        for axis in (0, 2)
-    )
-    aside = (x - BAR_X).abs() >= 0.05
-    return torch.where(aside, torch.inf, z - geometry.link_radii).amin(1)
 
 
 TASK = Task(

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from sports.humanoid.body import Body
-from sports.physics.base import GRAVITY, PhysicsState
+from sports.physics.base import GRAVITY, Marks, PhysicsState
 from sports.scene import Scene
 from sports.task import Advance, Memory, Task, View, clamp01, constant, nan_where, progress
 from sports.task import length as magnitude
@@ -61,10 +61,9 @@ def begin(view: View, context: Memory) -> Memory:
     """Memory after a reset: running, no mark yet."""
     root = view.root_pos[:, 0]
     zero = torch.zeros_like(root[:, 0])
-    points_x = view.geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0], 0)
     return {
         "root": root.clone(),
-        "rear": _rear(view, points_x),
+        "rear": _marks(view).rear,
         "mode": zero.long(),
         "since_landing": zero.clone(),
         "mark": torch.full_like(zero, torch.inf),
@@ -90,21 +89,12 @@ def advance(view: View, memory: Memory) -> Advance:
     x, y, z = root.unbind(-1)
     goal = constant(GOAL, root.device)
     touched = view.touching()[:, 0]  # (N, B) in any substep
-    geometry = view.geometry
-    points_x, points_z = (  # (N, L)
-        geometry.link_points(view.physics.body_pos[:, 0], view.rotation[:, 0], axis)
-        for axis in (0, 2)
-    )
-    clearance = points_z - geometry.link_radii
-    above = clearance >= TOUCH  # now
-    standing = geometry.least(clearance) < TOUCH  # (N, B)
-    rear = _rear(view, points_x)
+    marks = _marks(view)  # now
     # A link that touched within the step and is off again: all of it was at or beyond this x.
-    brief = touched & ~standing
-    brief_x = torch.where(brief, torch.minimum(rear, memory["rear"]), torch.inf)
-    nearest = torch.minimum(torch.where(above, torch.inf, points_x).amin(1), brief_x.amin(1))
-    front = torch.where(above, -torch.inf, points_x).amax(1)
-    front = torch.maximum(front, torch.where(brief, brief_x, -torch.inf).amax(1))
+    brief = touched & ~marks.standing
+    brief_x = torch.where(brief, torch.minimum(marks.rear, memory["rear"]), torch.inf)
+    nearest = torch.minimum(marks.nearest, brief_x.amin(1))
+    front = torch.maximum(marks.furthest, torch.where(brief, brief_x, -torch.inf).amax(1))
     touches = nearest < torch.inf
 
     mode = memory["mode"]
@@ -133,7 +123,7 @@ def advance(view: View, memory: Memory) -> Advance:
         "length": (30.0 * length).masked_fill(~success, 0.0),
     }
 
-    com, com_velocity = geometry.center_of_mass(view.physics, 0)
+    com, com_velocity = view.geometry.center_of_mass(view.physics, 0)
     takeoff_speed = torch.where(takes_off, magnitude(com_velocity), memory["takeoff_speed"])
     takeoff_com_z = torch.where(takes_off, com[:, 2], memory["takeoff_com_z"])
     landing_com_z = torch.where(lands, com[:, 2], memory["landing_com_z"])
@@ -151,7 +141,7 @@ def advance(view: View, memory: Memory) -> Advance:
     metrics |= {"success": success.float(), "foul": foul.float()}
     memory = {
         "root": root.clone(),
-        "rear": rear,
+        "rear": marks.rear,
         "mode": mode,
         "since_landing": since_landing,
         "mark": mark,
@@ -177,9 +167,8 @@ def length_bound(speed: Tensor, takeoff_z: Tensor, landing_z: Tensor) -> Tensor:
     return speed / GRAVITY * drop.sqrt() + 1.2
 
 
-def _rear(view: View, points_x: Tensor) -> Tensor:
-    """(N, B) smallest x of each link, of the support points' x (N, K)."""
-    return view.geometry.least(points_x - view.geometry.link_radii)
+def _marks(view: View) -> Marks:
+    return view.geometry.marks(view.physics.body_pos[:, 0], view.rotation[:, 0], TOUCH)
 
 
 TASK = Task(

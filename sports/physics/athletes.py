@@ -624,40 +624,77 @@ def look_at_contacts(
 # Points on the links' surfaces.
 
 
+class Surface(NamedTuple):
+    """Balls on the links."""
+
+    points: np.ndarray
+    """(K, 3) their centres, in the links' frames (m)."""
+    radii: np.ndarray
+    """(K,)"""
+    owners: np.ndarray
+    """(K,) their links, rising."""
+
+
 @compiled
-def place_points(
-    points: np.ndarray,
-    owners: np.ndarray,
-    axis: int,
+def put_across(
+    surface: Surface, k: int, pos: np.ndarray, rot: np.ndarray, link: np.ndarray, at: np.ndarray
+) -> None:
+    """Writes x and z of a ball's centre to (2, N), from pos (N, B, 3) and rot (N, B, 3, 3).
+    ``link`` (8, N) keeps what is needed of its link, as long as the balls come by link."""
+    i, n = surface.owners[k], at.shape[1]
+    if k == 0 or surface.owners[k - 1] != i:
+        for row in range(2):
+            for w in range(n):
+                link[4 * row, w] = pos[w, i, 2 * row]
+            for j in range(3):
+                for w in range(n):
+                    link[4 * row + 1 + j, w] = rot[w, i, 2 * row, j]
+    x, y, z = surface.points[k]
+    for row in range(2):
+        o = 4 * row
+        for w in range(n):
+            at[row, w] = link[o, w] + link[o + 1, w] * x + link[o + 2, w] * y + link[o + 3, w] * z
+
+
+@compiled
+def find_marks(
+    surface: Surface,
     pos: np.ndarray,
     rot: np.ndarray,
-    out: np.ndarray,
+    below: float,
+    standing: np.ndarray,
+    rear: np.ndarray,
+    ends: np.ndarray,
 ) -> None:
-    """Writes the coordinate of points (K, 3) along a world axis to (K, N).
-
-    ``owners`` (K,) their links, rising; ``pos`` (N, B, 3) and ``rot`` (N, B, 3, 3) of the links.
-    """
-    near, link = np.empty((4, out.shape[1]), np.float32), -1
-    for k in range(len(points)):
-        if owners[k] != link:
-            link = owners[k]
-            for w in range(out.shape[1]):
-                near[0, w] = pos[w, link, axis]
-                for j in range(3):
-                    near[1 + j, w] = rot[w, link, axis, j]
-        x, y, z = points[k]
-        for w in range(out.shape[1]):
-            out[k, w] = near[0, w] + near[1, w] * x + near[2, w] * y + near[3, w] * z
+    """Writes ``Geometry.marks``: standing (B, N), rear (B, N), nearest and furthest (2, N)."""
+    n = ends.shape[1]
+    link, at = np.empty((8, n), np.float32), np.empty((2, n), np.float32)
+    standing[:], rear[:], ends[0], ends[1] = False, np.inf, np.inf, -np.inf
+    for k in range(len(surface.radii)):
+        put_across(surface, k, pos, rot, link, at)
+        i, radius = surface.owners[k], surface.radii[k]
+        for w in range(n):
+            rear[i, w] = min(rear[i, w], at[0, w] - radius)
+        for w in range(n):
+            if at[1, w] - radius < below:
+                standing[i, w] = True
+                ends[0, w] = min(ends[0, w], at[0, w])
+                ends[1, w] = max(ends[1, w], at[0, w])
 
 
 @compiled
-def least_of_links(owners: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
-    """Writes the least of each link's ``values`` (K, N) to (B, N)."""
+def find_lowest(
+    surface: Surface, pos: np.ndarray, rot: np.ndarray, x: float, reach: float, out: np.ndarray
+) -> None:
+    """Writes ``Geometry.lowest_near`` to (N,)."""
+    n = len(out)
+    link, at = np.empty((8, n), np.float32), np.empty((2, n), np.float32)
     out[:] = np.inf
-    for k in range(len(owners)):
-        i = owners[k]
-        for w in range(out.shape[1]):
-            out[i, w] = min(out[i, w], values[k, w])
+    for k in range(len(surface.radii)):
+        put_across(surface, k, pos, rot, link, at)
+        for w in range(n):
+            if abs(at[0, w] - x) < reach:
+                out[w] = min(out[w], at[1, w] - surface.radii[k])
 
 
 @compiled

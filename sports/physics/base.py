@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -128,6 +128,19 @@ def _middle(shape: Shape) -> np.ndarray:
     return center if shape.end is None else (center + np.asarray(shape.end)) / 2
 
 
+class Marks(NamedTuple):
+    """Where N athletes meet the ground along the x axis (m)."""
+
+    standing: Tensor
+    """(N, B) bool, links of which a ball is near the ground."""
+    rear: Tensor
+    """(N, B) smallest x of each link, near the ground or not."""
+    nearest: Tensor
+    """(N,) smallest x of the points near the ground; inf where there is none."""
+    furthest: Tensor
+    """(N,) largest x of them; -inf where there is none."""
+
+
 class Geometry:
     """Support points of the body's links: where a link ends in a direction, where it touches.
 
@@ -174,24 +187,32 @@ class Geometry:
     def _padded_radii(self) -> Tensor:
         return self.radii[self.padded]
 
-    @cached_property
-    def link_radii(self) -> Tensor:
-        """(L,) radii of the balls around ``link_points``."""
-        return self._padded_radii.T.flatten()
-
-    def link_points(self, body_pos: Tensor, rotation: Tensor, axis: int) -> Tensor:
-        """(N, L) coordinate along a world axis of the support points, in an order of its own and
-        perhaps some more than once; the balls around them have ``link_radii``. ``body_pos``
-        (N, B, 3) and ``rotation`` R_WB (N, B, 3, 3) are the links'."""
-        # Worlds in the last axis: rows of three numbers and tiny products are slow on a CPU.
+    def _along(self, body_pos: Tensor, rotation: Tensor, axis: int) -> Tensor:
+        """(K', B, N) coordinate of the padded points along a world axis."""
         x, y, z = rotation[:, :, axis].permute(2, 1, 0)  # (B, N) each
         px, py, pz = self._point_columns  # (K', B, 1) each
-        points = torch.addcmul(body_pos[:, :, axis].T, x, px).addcmul_(y, py).addcmul_(z, pz)
-        return points.flatten(0, 1).T
+        return torch.addcmul(body_pos[:, :, axis].T, x, px).addcmul_(y, py).addcmul_(z, pz)
 
-    def least(self, values: Tensor) -> Tensor:
-        """(N, B) least of each link's ``values`` (N, L), one for each of its ``link_points``."""
-        return values.T.unflatten(0, (-1, self.num_links)).amin(0).T
+    def marks(self, body_pos: Tensor, rotation: Tensor, below: float) -> Marks:
+        """Where athletes meet the ground: with balls that reach ``below`` (m) a height.
+        ``body_pos`` (N, B, 3) and ``rotation`` R_WB (N, B, 3, 3) are the links'."""
+        x, z = (self._along(body_pos, rotation, axis) for axis in (0, 2))
+        radii = self._padded_radii.T[..., None]
+        clearance = z - radii
+        above = clearance >= below
+        return Marks(
+            standing=(clearance.amin(0) < below).T,
+            rear=(x - radii).amin(0).T,
+            nearest=torch.where(above, torch.inf, x).amin((0, 1)),
+            furthest=torch.where(above, -torch.inf, x).amax((0, 1)),
+        )
+
+    def lowest_near(self, body_pos: Tensor, rotation: Tensor, x: float, reach: float) -> Tensor:
+        """(N,) height (m) of the lowest of the balls whose centres are less than ``reach`` from a
+        plane across the x axis; inf where there is none. The links as for ``marks``."""
+        along, z = (self._along(body_pos, rotation, axis) for axis in (0, 2))
+        aside = (along - x).abs() >= reach
+        return torch.where(aside, torch.inf, z - self._padded_radii.T[..., None]).amin((0, 1))
 
     def world_points(self, body_pos: Tensor, body_quat: Tensor) -> Tensor:
         """(..., K, 3) support points in the world; the balls around them have ``radii``."""

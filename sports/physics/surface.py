@@ -8,27 +8,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sports.physics.athletes import least_of_links, place_points
-from sports.physics.base import Geometry
+from sports.physics.athletes import Surface, find_lowest, find_marks
+from sports.physics.base import Geometry, Marks
 
 
 class CompiledGeometry(Geometry):
     """See :class:`sports.physics.base.Geometry`."""
 
     @cached_property
-    def link_radii(self) -> Tensor:
-        return self.radii
+    def _surface(self) -> Surface:
+        return Surface(self.points.numpy(), self.radii.numpy(), self.owner.numpy())
 
-    @cached_property
-    def _table(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.points.numpy(), self.owner.numpy()
+    def marks(self, body_pos: Tensor, rotation: Tensor, below: float) -> Marks:
+        n = len(body_pos)
+        standing = torch.empty(self.num_links, n, dtype=torch.bool)
+        rear, ends = torch.empty(self.num_links, n), torch.empty(2, n)
+        links = body_pos.numpy(), rotation.numpy()
+        find_marks(
+            self._surface, *links, np.float32(below), standing.numpy(), rear.numpy(), ends.numpy()
+        )
+        return Marks(standing.T, rear.T, *ends)
 
-    def link_points(self, body_pos: Tensor, rotation: Tensor, axis: int) -> Tensor:
-        out = torch.empty(len(self.points), len(body_pos))
-        place_points(*self._table, axis, body_pos.numpy(), rotation.numpy(), out.numpy())
-        return out.T
-
-    def least(self, values: Tensor) -> Tensor:
-        out = torch.empty(self.num_links, len(values))
-        least_of_links(self._table[1], values.numpy().T, out.numpy())
-        return out.T
+    def lowest_near(self, body_pos: Tensor, rotation: Tensor, x: float, reach: float) -> Tensor:
+        out = torch.empty(len(body_pos))
+        links = body_pos.numpy(), rotation.numpy()
+        find_lowest(self._surface, *links, np.float32(x), np.float32(reach), out.numpy())
+        return out

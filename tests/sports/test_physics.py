@@ -184,15 +184,23 @@ def test_points_of_the_links_are_those_of_the_table():
     compiled, plain = physics.geometry, Geometry(scene.body, "cpu")
     pos, rot = physics.body_pos[:, 0], physics.body_rot[:, 0]
     points = plain.world_points(physics.body_pos, physics.body_quat)[:, 0]
-    for axis in range(3):
-        surface = points[..., axis] - plain.radii
-        links = [surface[:, plain.owner == i].amin(1) for i in range(plain.num_links)]
+    x, bottom = points[..., 0], points[..., 2] - plain.radii
+    of = [plain.owner == i for i in range(plain.num_links)]
+    rear = torch.stack([(x - plain.radii)[:, i].amin(1) for i in of], 1)
+    # In the second case no world has a point near the ground, or near the plane.
+    for below, plane in ((float(bottom.median()), float(x.median())), (-20.0, 50.0)):
+        low, near = bottom < below, (x - plane).abs() < 0.3
+        assert bool(low.any()) == bool(near.any()) == (below > -20.0)
+        standing = torch.stack([low[:, i].any(1) for i in of], 1)
+        ends = x.masked_fill(~low, torch.inf).amin(1), x.masked_fill(~low, -torch.inf).amax(1)
+        lowest = bottom.masked_fill(~near, torch.inf).amin(1)
         for geometry in (compiled, plain):
-            along = geometry.link_points(pos, rot, axis)
-            furthest = along.amax(1), points[..., axis].amax(1)
-            torch.testing.assert_close(*furthest, rtol=1e-5, atol=1e-5)
-            least = geometry.least(along - geometry.link_radii)
-            torch.testing.assert_close(least, torch.stack(links, 1), rtol=1e-5, atol=1e-5)
+            marks = geometry.marks(pos, rot, below)
+            assert (marks.standing == standing).all()
+            for got, expected in zip(marks[1:], (rear, *ends), strict=True):
+                torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-5)
+            got = geometry.lowest_near(pos, rot, plane, 0.3)
+            torch.testing.assert_close(got, lowest, rtol=1e-5, atol=1e-5)
 
 
 def test_extent_agrees_with_the_support_points():
