@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
-from olympics_opt.meter import SIGMA, STEPS, Row, measure
+from olympics_opt.meter import SIGMA, STEPS, WORLDS, Row, measure
 from rl import provenance
 from sports.registry import get_task, task_names
 from warmstart.atomic import write_json
@@ -34,10 +34,10 @@ class BenchConfig:
     """Engines; by default mujoco, and warp where there is a GPU."""
     task: tuple[str, ...] = ()
     """Tasks; by default all."""
-    worlds: int | None = None
-    """Worlds; by default 256 on mujoco, 8192 on warp, 4 on drake."""
+    worlds: tuple[int, ...] = ()
+    """Numbers of worlds; by default 256 and 1024 on mujoco, 8192 on warp, 4 on drake."""
     seconds: float = 30.0
-    """Time of measurement for each task on each engine; at least three turns are taken."""
+    """Time of measurement for each row; at least three turns are taken."""
     training: bool = True
     """Measure training too."""
     seed: int = 0
@@ -49,7 +49,7 @@ def bench(
     *,
     engines: Sequence[str] = (),
     tasks: Sequence[str] = (),
-    worlds: int | None = None,
+    worlds: Sequence[int] = (),
     seconds: float = 30.0,
     training: bool = True,
     seed: int = 0,
@@ -63,7 +63,7 @@ def bench(
         out: JSON file.
         engines: by default ``mujoco``, and ``warp`` where there is a GPU.
         tasks: by default all.
-        worlds: by default the engine's usual number.
+        worlds: by default the engine's usual numbers.
         seconds: time of measurement for each row.
         training: measure training too.
         seed: of actions, starts and networks.
@@ -98,28 +98,33 @@ def bench(
         "rows": [],
     }
     rows: list[Row] = []
+    what = [
+        (engine, task, count)
+        for engine in engines
+        for task in tasks
+        for count in worlds or WORLDS.get(engine, (1,))
+    ]
     with Progress(console=console, transient=True, disable=quiet) as progress:
-        for engine in engines:
-            for task in tasks:
-                bar = progress.add_task(f"{task} on {engine}", total=1.0)
+        for engine, task, count in what:
+            bar = progress.add_task(f"{task} on {engine}, {count} worlds", total=1.0)
 
-                def show(turns: int, share: float, bar: Any = bar) -> None:
-                    progress.update(bar, completed=min(share, 1.0))
+            def show(turns: int, share: float, bar: Any = bar) -> None:
+                progress.update(bar, completed=min(share, 1.0))
 
-                rows.append(
-                    measure(
-                        task,
-                        engine,
-                        worlds=worlds,
-                        seconds=seconds,
-                        training=training,
-                        seed=seed,
-                        on_turn=show,
-                    )
+            rows.append(
+                measure(
+                    task,
+                    engine,
+                    worlds=count,
+                    seconds=seconds,
+                    training=training,
+                    seed=seed,
+                    on_turn=show,
                 )
-                progress.remove_task(bar)
-                result["rows"] = [asdict(row) for row in rows]
-                write_json(out, result)
+            )
+            progress.remove_task(bar)
+            result["rows"] = [asdict(row) for row in rows]
+            write_json(out, result)
     console.print(_table(rows))
     console.print(f"{provenance.hardware()}; commit {provenance.commit()}; written to {out}")
     return result

@@ -34,7 +34,9 @@ from rl.ppo import PPO, PPOConfig
 from rl.rollout import collect
 from sports.env import Env, make_env
 
-WORLDS = {"mujoco": 256, "warp": 8192, "drake": 4}
+WORLDS = {"mujoco": (256, 1024), "warp": (8192,), "drake": (4,)}
+"""Usual numbers of worlds. 256 is what training on a CPU takes; with more the fixed cost of a step
+weighs less."""
 STEPS = 24
 """Control steps of one measurement: a rollout of the trainer."""
 RELOAD = {"cpu": 1, "cuda": 8}
@@ -248,7 +250,7 @@ def measure(
     task: str,
     engine: str,
     *,
-    worlds: int | None = None,
+    worlds: int,
     seconds: float = 30.0,
     training: bool = True,
     seed: int = 0,
@@ -259,7 +261,7 @@ def measure(
     Args:
         task: name of a task.
         engine: ``mujoco``, ``warp`` or ``drake``.
-        worlds: number of worlds; None for the engine's usual.
+        worlds: number of worlds.
         seconds: time of measurement; at least three turns are taken.
         training: measure training too (never on drake).
         seed: of actions, starts and networks.
@@ -269,7 +271,7 @@ def measure(
         ValueError: unknown task or engine. RuntimeError: the engine cannot run here.
     """
     began = time.perf_counter()
-    env = make_env(task, engine=engine, num_worlds=worlds or WORLDS.get(engine, 1), seed=seed)
+    env = make_env(task, engine=engine, num_worlds=worlds, seed=seed)
     try:
         meter = Meter(env, seed=seed, training=training and engine != "drake")
         # First calls compile, allocate and capture.
