@@ -21,11 +21,12 @@ from sports.physics import Physics, PhysicsState, default_state, make_physics
 from sports.registry import get_task, make_config
 from sports.scene import Scene
 from sports.starts import Starts, Stock, add_noise
-from sports.task import Memory, Task, View, falling_heights
+from sports.task import Memory, Task, View, falling_forces, falling_heights
 
 no_autograd = getattr(torch._C, "_AutoDispatchBelowAutograd", contextlib.nullcontext)
 """Nothing in a step has a gradient. Without torch's book-keeping for them its many small operations
-take a tenth less time; unlike those of ``torch.inference_mode`` the results are plain tensors."""
+take a tenth less time on a CPU (a GPU does not wait for them); unlike those of
+``torch.inference_mode`` the results are plain tensors."""
 
 
 @dataclass
@@ -92,8 +93,8 @@ class Env:
             curriculum=task.curriculum(config, n, self.device) if task.curriculum else {},
             clock=torch.zeros(n, dtype=torch.long, device=self.device),
             control_timestep=scene.control_timestep,
-            foot_links=torch.tensor(foot, device=self.device),
             lowest=torch.tensor(falling_heights(body.link_names, foot), device=self.device),
+            heaviest=torch.tensor(falling_forces(foot), device=self.device).square(),
         )
         self._default = default_state(scene, n, self.device)
         self._stocks = hasattr(physics, "prepare")
@@ -131,7 +132,7 @@ class Env:
                 f"action has shape {tuple(action.shape)}, expected "
                 f"{(self.num_worlds, self.num_agents, self.action_size)}"
             )
-        with no_autograd():
+        with no_autograd() if self._stocks else contextlib.nullcontext():
             return self._step(action)
 
     def _step(self, action: Tensor) -> StepResult:
@@ -194,7 +195,7 @@ class Env:
         stock = self._stock
         if stock is None or not stock.serves(worlds, self.curriculum):
             stock = self._stock = self._prepare(*self._draw())
-        stock.used[worlds] = True
+        stock.used.numpy()[worlds.numpy()] = True
         cast(Any, self.physics).restart(worlds, stock.shown)
         self.view.clock = self.view.clock.index_fill(0, worlds, 0)
         self.age = self.age.index_fill(0, worlds, 0)

@@ -91,10 +91,10 @@ def advance(view: View, memory: Memory) -> Advance:
     touched = view.touching()[:, 0]  # (N, B) in any substep
     marks = _marks(view)  # now
     # A link that touched within the step and is off again: all of it was at or beyond this x.
-    brief = touched & ~marks.standing
-    brief_x = torch.where(brief, torch.minimum(marks.rear, memory["rear"]), torch.inf)
-    nearest = torch.minimum(marks.nearest, brief_x.amin(1))
-    front = torch.maximum(marks.furthest, torch.where(brief, brief_x, -torch.inf).amax(1))
+    never = ~touched | marks.standing
+    brief_x = torch.minimum(marks.rear, memory["rear"])
+    nearest = torch.minimum(marks.nearest, brief_x.masked_fill(never, torch.inf).amin(1))
+    front = torch.maximum(marks.furthest, brief_x.masked_fill(never, -torch.inf).amax(1))
     touches = nearest < torch.inf
 
     mode = memory["mode"]

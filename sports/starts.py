@@ -78,7 +78,7 @@ class Stock:
         same = all(
             torch.equal(v[worlds], curriculum[k][worlds]) for k, v in self.curriculum.items()
         )
-        return same and not bool(self.used[worlds].any())
+        return same and not self.used.numpy()[worlds.numpy()].any()
 
     def state_dict(self) -> dict[str, Tensor]:
         """What it can be worked out from again."""

@@ -35,10 +35,10 @@ class View:
     clock: Tensor
     """(N,) control steps since the reset; 1 after the first step."""
     control_timestep: float
-    foot_links: Tensor
-    """(B,) bool: ankles and toes, the links that may touch the ground."""
     lowest: Tensor
     """(B,) heights (m) below which a link's origin means a fall; -inf for ankles and toes."""
+    heaviest: Tensor
+    """(B,) squared forces of the ground (N^2) above which a link has fallen; inf for those."""
     _heading: Heading | None = None
     _pressure: Tensor | None = None
 
@@ -83,14 +83,18 @@ class View:
         """(N, A) sports.md, Common: a link other than ankles and toes below 0.15 m (head 0.30 m)
         or pressed on the ground with more than 50 N; from the second control step on."""
         low = self.physics.body_pos[..., 2] < self.lowest
-        pressed = (self.pressure > 50.0**2) & ~self.foot_links
-        return (low | pressed).any(-1) & (self.clock >= 2)[:, None]
+        return (low | (self.pressure > self.heaviest)).any(-1) & (self.clock >= 2)[:, None]
 
 
 def falling_heights(link_names: Sequence[str], foot_links: Sequence[bool]) -> list[float]:
-    """``View.lowest`` of a body's links (m)."""
+    """``View.lowest`` of a body's links (m), of which those may stand on the ground."""
     heights = [0.30 if name == "Head" else 0.15 for name in link_names]
     return [-math.inf if foot else h for h, foot in zip(heights, foot_links)]
+
+
+def falling_forces(foot_links: Sequence[bool]) -> list[float]:
+    """Forces (N) of the ground above which those links have fallen that may not stand on it."""
+    return [math.inf if foot else 50.0 for foot in foot_links]
 
 
 @dataclass

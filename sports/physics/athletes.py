@@ -590,12 +590,17 @@ def show_object(
 
 
 @compiled
-def show_numbers(rows: np.ndarray, columns: np.ndarray, limit: float, bad: np.ndarray) -> None:
-    """Writes (N, k) to (k, N); sets ``bad`` (N,) where a number is not below a limit, or is NaN."""
+def show_numbers(rows: np.ndarray, columns: np.ndarray, limit: float, bad: np.ndarray) -> bool:
+    """Writes (N, k) to (k, N); sets ``bad`` (N,) where a number is not below a limit, or is NaN.
+    Whether there was one."""
+    found = False
     for j in range(len(columns)):
         for w in range(len(rows)):
             columns[j, w] = rows[w, j]
-            bad[w] |= not abs(rows[w, j]) < limit
+            beyond = not abs(rows[w, j]) < limit
+            bad[w] |= beyond
+            found |= beyond
+    return found
 
 
 @compiled

@@ -56,14 +56,12 @@ class MujocoPhysics:
         self.object_pos, self.object_quat = shown.object_pos, shown.object_quat
         self.object_linvel, self.object_angvel = shown.object_linvel, shown.object_angvel
         self.ground_force, self.pair_force = shown.ground_force, shown.pair_force
-        self.bad = torch.zeros(n, dtype=torch.bool)
+        self.bad = torch.from_numpy(out.bad)
         self.nan_worlds = 0
         self.overflow = 0
 
     def step(self, ctrl: Tensor) -> None:
-        self._worlds.step(ctrl.numpy())
-        self.bad = torch.from_numpy(self._out.bad.copy())
-        if self._out.bad.any():
+        if self._worlds.step(ctrl.numpy()):
             self.nan_worlds += int(self.bad.sum())
             safe = default_state(self.scene, self.num_worlds, self.device)
             safe.mocap_pos = self.mocap_pos.clone()

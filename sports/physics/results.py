@@ -152,14 +152,16 @@ def _turned(array: np.ndarray) -> Tensor:
     return turned.movedim(1, -1)
 
 
-def show_state(scene: Scene, qpos: np.ndarray, qvel: np.ndarray, out: Results) -> None:
-    """The state itself (N, nq), (N, nv), float64, and the free objects."""
+def show_state(scene: Scene, qpos: np.ndarray, qvel: np.ndarray, out: Results) -> bool:
+    """The state itself (N, nq), (N, nv), float64, and the free objects. Whether it is bad in some
+    world."""
     out.bad[:] = False
-    show_numbers(qpos, out.qpos, np.inf, out.bad)
-    show_numbers(qvel, out.qvel, SPEED_LIMIT, out.bad)
+    lost = show_numbers(qpos, out.qpos, np.inf, out.bad)
+    lost |= show_numbers(qvel, out.qvel, SPEED_LIMIT, out.bad)
     for k, o in enumerate(scene.free_objects):
         state = qpos[:, scene.object_qpos(o.name)], qvel[:, scene.object_qvel(o.name)]
         show_object(*state, *(getattr(out.objects, f.name)[:, k] for f in fields(Motion)))
+    return lost
 
 
 def show(

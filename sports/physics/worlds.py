@@ -46,6 +46,7 @@ class Worlds:
             AthleteKeeper(model, batch.bind, body_name(agent, body.link_names[0]))
             for agent in range(scene.num_agents)
         ]
+        self._athletes = [out.athlete(agent) for agent in range(scene.num_agents)]
         self._constraint, self._sensors = batch.bind("qfrc_constraint"), batch.bind("sensordata")
         self._peaks = np.zeros((n, out.ground_force.shape[1] + len(out.pair_force)))
         self._timesteps: list[np.ndarray] | None = None
@@ -56,8 +57,8 @@ class Worlds:
         self._fresh = batch.state[0].copy()
         self.show()
 
-    def step(self, ctrl: np.ndarray) -> None:
-        """One control step with targets (n, nu)."""
+    def step(self, ctrl: np.ndarray) -> bool:
+        """One control step with targets (n, nu). Whether some world has diverged."""
         out = self._out
         self._ctrl[:] = ctrl
         self._peaks[:] = out.ground_force[:] = out.pair_force[:] = 0.0
@@ -71,10 +72,9 @@ class Worlds:
             if i < self.scene.substeps - 1:
                 for keeper in self.keepers:
                     keeper.correct(current=False)
-        for agent, (tree, keeper) in enumerate(zip(self._trees, self.keepers)):
-            state = self._constraint, self.qpos, self.qvel
-            finish_athlete(tree, keeper.kept, *state, out.athlete(agent))
-        show_state(self.scene, self.qpos, self.qvel, out)
+        for tree, keeper, athlete in zip(self._trees, self.keepers, self._athletes):
+            finish_athlete(tree, keeper.kept, self._constraint, self.qpos, self.qvel, athlete)
+        return show_state(self.scene, self.qpos, self.qvel, out)
 
     def take(self, ids: np.ndarray) -> None:
         """Puts worlds ``ids`` into the states that ``out`` shows."""
