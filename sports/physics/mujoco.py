@@ -108,4 +108,4 @@ class MujocoPhysics:
         self._worlds.load(*(state[name].numpy() for name in names))
 
     def close(self) -> None:
-        del self._worlds
+        self.__dict__.pop("_worlds", None)
