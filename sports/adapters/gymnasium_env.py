@@ -9,7 +9,7 @@
     envs = gymnasium.make_vec("olympics/LongJump-v0", num_envs=256)
 
 Observations and actions are those of ``sports.env.Env``, rewards unscaled. An episode's metrics are
-in the ``info`` of its last step. A world in which the engine diverged is truncated, and its ``info``
+in the ``info`` of its last step. A world in which the engine diverged is truncated; its ``info``
 says ``diverged``.
 """
 
