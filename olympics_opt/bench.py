@@ -13,12 +13,15 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
-from olympics_opt.meter import SIGMA, STEPS, WORLDS, Row, measure
+from olympics_opt.meter import SIGMA, STEPS, Row, measure
 from rl import provenance
 from sports.registry import get_task, task_names
 from warmstart.atomic import write_json
 
 Engine = Literal["mujoco", "warp", "drake"]
+WORLDS = {"mujoco": (256, 1024), "warp": (8192,), "drake": (4,)}
+"""Usual numbers of worlds. 256 is what training on a CPU takes; with more the fixed cost of a step
+weighs less."""
 ENVIRONMENT_SHARE, TRAINING_SHARE = 0.85, 0.75
 """What the environment and training should keep of the speed of bare physics; training is
 judged on a GPU only, where the learner does not share the engine's processors."""

@@ -34,9 +34,6 @@ from rl.ppo import PPO, PPOConfig
 from rl.rollout import collect
 from sports.env import Env, make_env
 
-WORLDS = {"mujoco": (256, 1024), "warp": (8192,), "drake": (4,)}
-"""Usual numbers of worlds. 256 is what training on a CPU takes; with more the fixed cost of a step
-weighs less."""
 STEPS = 24
 """Control steps of one measurement: a rollout of the trainer."""
 RELOAD = {"cpu": 1, "cuda": 8}

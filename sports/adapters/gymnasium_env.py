@@ -25,12 +25,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from sports.env import Env, StepResult, make_env
-from sports.humanoid.body import Limits, Strength
 from sports.registry import task_names
 
 
-def _make(task: str, num_worlds: int, training: bool, **settings: Any) -> Env:
-    env = make_env(task, num_worlds=num_worlds, training=training, **settings)
+def _make(task: str, num_worlds: int, settings: dict[str, Any]) -> Env:
+    env = make_env(task, num_worlds=num_worlds, **settings)
     if env.num_agents != 1:
         env.close()
         raise ValueError(f"task '{task}' has {env.num_agents} athletes; Gymnasium knows one")
@@ -72,22 +71,11 @@ class OlympicsEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     metadata = {"render_modes": [], "render_fps": 30}
 
-    def __init__(
-        self,
-        task: str,
-        *,
-        engine: str = "mujoco",
-        strength: Strength = "paper",
-        limits: Limits = "paper",
-        training: bool = True,
-        options: dict[str, Any] | None = None,
-        render_mode: None = None,
-    ) -> None:
-        """``options`` of the task; ``training`` for start noise and curriculum, false for the
-        conditions of an evaluation. Raises ValueError for what is unknown."""
-        self.env = _make(
-            task, 1, training, engine=engine, strength=strength, limits=limits, options=options
-        )
+    def __init__(self, task: str, *, render_mode: None = None, **settings: Any) -> None:
+        """``settings`` of ``sports.env.make_env``: engine, strength, limits, options of the task;
+        ``training`` for start noise and curriculum, false for the conditions of an evaluation.
+        Raises ValueError for what is unknown."""
+        self.env = _make(task, 1, settings)
         self.observation_space, self.action_space = _spaces(self.env)
         self.render_mode = render_mode
 
@@ -122,27 +110,10 @@ class OlympicsVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     metadata = {"render_modes": [], "render_fps": 30, "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
-        self,
-        task: str,
-        num_envs: int = 256,
-        *,
-        engine: str = "mujoco",
-        strength: Strength = "paper",
-        limits: Limits = "paper",
-        training: bool = True,
-        options: dict[str, Any] | None = None,
-        render_mode: None = None,
+        self, task: str, num_envs: int = 256, *, render_mode: None = None, **settings: Any
     ) -> None:
         """As for :class:`OlympicsEnv`."""
-        self.env = _make(
-            task,
-            num_envs,
-            training,
-            engine=engine,
-            strength=strength,
-            limits=limits,
-            options=options,
-        )
+        self.env = _make(task, num_envs, settings)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.single_observation_space, self.single_action_space = _spaces(self.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
