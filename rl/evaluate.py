@@ -331,7 +331,7 @@ def _play_episodes(
         obs, step = result.obs, step + 1
         tape.add(action, result)
         bad = (~result.valid).cpu().numpy()
-        ended = (result.terminated | result.truncated).cpu().numpy() | bad
+        ended = result.ended.cpu().numpy() | bad
         returns += np.where(bad, 0.0, result.reward.mean(-1).cpu().numpy())
         if not ended.any():
             continue

@@ -35,5 +35,5 @@ class ImpactCost:
         """(N, A) bonus, never positive, of the step just taken; 0 where the world was reset."""
         force = self.env.physics.ground_force.norm(dim=-1) / self.unit  # (N, A, B)
         excess = (force - self.limit).clamp(0.0, MOST)
-        running = ~(result.terminated | result.truncated) & result.valid
+        running = ~result.ended & result.valid
         return -self.weight * excess.sum(-1) * running[:, None]

@@ -28,7 +28,7 @@ class EpisodeMeter:
         """Takes one step in."""
         self._terms = self._terms or tuple(result.terms)
         valid = result.valid
-        ended = result.terminated | result.truncated
+        ended = result.ended
         self._return += torch.where(valid[:, None], result.reward, 0.0)
         self._length += 1.0
         sums = [

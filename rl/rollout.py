@@ -84,8 +84,8 @@ def collect(
     """
     device, agents = actor.device, env.num_agents
 
-    def rows(flag: Tensor) -> Tensor:  # (N,) per world -> (M,) per agent
-        return flag.to(device)[:, None].expand(-1, agents).reshape(-1)
+    def rows(of_worlds: Tensor) -> Tensor:  # (N,) per world -> (M,) per agent
+        return of_worlds.to(device)[:, None].expand(-1, agents).reshape(-1)
 
     for t in range(rollout.steps):
         stored, action, mean, log_prob = actor.act(obs.to(device).flatten(0, 1))
@@ -95,12 +95,12 @@ def collect(
         valid = rows(result.valid)
         reward = sum((bonus(result) for bonus in bonuses), result.reward)
         reward = reward.to(device).flatten() / env.reward_scale
-        terminated = rows(result.terminated)
+        terminated = result.terminated.to(device).flatten()
         steps_paid = torch.where(terminated, rows(result.remaining_paid), 0.0)
         rollout.reward[t] = torch.where(valid, pay_remaining(reward, steps_paid, gamma), 0.0)
         rollout.final_obs[t] = actor.prepare(result.final_obs.to(device).flatten(0, 1))
         rollout.terminated[t] = terminated
-        rollout.truncated[t] = rows(result.truncated)
+        rollout.truncated[t] = result.truncated.to(device).flatten()
         rollout.valid[t] = valid
         if on_step is not None:
             on_step(result)

@@ -42,15 +42,20 @@ class StepResult:
     terms: dict[str, Tensor]
     """Reward terms by name, (N, A)."""
     terminated: Tensor
-    """(N,) bool: the sport ended the episode; no bootstrap."""
+    """(N, A) bool: the sport ended the agent's episode; no bootstrap."""
     truncated: Tensor
-    """(N,) bool: the time limit ended it; bootstrap."""
+    """(N, A) bool: the time limit or another agent's end cut it off; bootstrap."""
     valid: Tensor
     """(N,) bool: false where the engine diverged; mask the sample, the world is already reset."""
     remaining_paid: Tensor
     """(N,) steps for which this step's reward is paid on (0 for most)."""
     metrics: dict[str, Tensor]
     """(N,) episode metrics, to be read where the episode ended."""
+
+    @property
+    def ended(self) -> Tensor:
+        """(N,) bool: the world began a new episode, but where it diverged (``valid``)."""
+        return (self.terminated | self.truncated).any(-1)
 
 
 class Env:
@@ -148,17 +153,20 @@ class Env:
         lost = bad[:, None]
         terms = {k: v.masked_fill(lost, 0.0) for k, v in step.terms.items()}
         reward = reduce(torch.add, terms.values())
-        terminated = step.terminated & valid
-        truncated = (self.age >= self.max_steps) & valid & ~terminated
-        over = terminated | truncated
+        terminated = step.terminated & valid[:, None]
+        over = (terminated.any(-1) | (self.age >= self.max_steps)) & valid
+        truncated = over[:, None] & ~terminated
         ended = over | bad
+        if step.move is not None:
+            self.physics.move(step.move.mask & ~ended, step.move.qpos, step.move.qvel)
+            self.view.refresh()
         final_obs = self._observe()
         if self.keep_snapshot:
             self.final_snapshot = self.snapshot()
         remaining = torch.zeros(self.num_worlds, device=self.device)
         if step.remaining_paid is not None:
             left = (self.max_steps - self.view.clock).clamp(min=0).float()
-            remaining = torch.where(step.remaining_paid & terminated, left, remaining)
+            remaining = torch.where(step.remaining_paid & terminated.all(-1), left, remaining)
         if self.task.promote is not None:
             self.view.curriculum = self.task.promote(self.view, self.memory, step, over)
 

@@ -154,7 +154,7 @@ def advance(view: View, memory: Memory) -> Advance:
     return Advance(
         memory=memory,
         terms={name: term[:, None] for name, term in terms.items()},
-        terminated=failed | success,
+        terminated=(failed | success)[:, None],
         metrics=metrics,
         success=success,
     )

@@ -7,6 +7,7 @@ z = 0, play along +x. Units: m, kg, s, rad.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,12 +18,16 @@ from sports.humanoid.body import Body, Shape
 
 @dataclass(frozen=True)
 class Start:
-    """Where an athlete stands at the zero pose, and which way it faces."""
+    """Where an athlete stands, which way it faces, and how."""
 
     x: float = 0.0
     y: float = 0.0
     yaw: float = 0.0
     """Heading about +z (rad); 0 faces +x."""
+    pose: Mapping[str, float] = field(default_factory=dict)
+    """Joint angles (rad) by dof; 0 for the others."""
+    z: float | None = None
+    """Height of the root (m); None for soles 5 mm above ground at the zero pose."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +66,9 @@ class Scene:
     objects: tuple[SceneObject, ...] = ()
     contact_pairs: tuple[tuple[str, str], ...] = ()
     """Pairs reported in ``Physics.pair_force``; each side is ``"agent0"`` (all its links), a
-    link ``"agent0/L_Hand"``, or an object's name."""
+    link ``"agent0/L_Hand"``, one of its shapes ``"agent0/L_Hand:1"``, or an object's name."""
+    link_contacts: bool = False
+    """Whether ``Physics.link_force`` is wanted."""
     timestep: float = 1.0 / 120.0
     substeps: int = 4
     ground_friction: float = 1.0
@@ -129,14 +136,18 @@ class Scene:
         return names.index(name)
 
     def default_qpos(self) -> np.ndarray:
-        """(nq,) every athlete at the zero pose, soles 5 mm above ground; objects at rest."""
+        """(nq,) every athlete in its start pose, objects where the scene puts them."""
         qpos = np.zeros(self.nq)
         height = self.body.standing_height()
+        dofs = [dof.name for dof in self.body.dofs]
         for i, start in enumerate(self.agents):
-            qpos[self.agent_qpos(i)][:7] = (
+            own = qpos[self.agent_qpos(i)]
+            for name, angle in start.pose.items():
+                own[7 + dofs.index(name)] = angle
+            own[:7] = (
                 start.x,
                 start.y,
-                height,
+                height if start.z is None else start.z,
                 math.cos(start.yaw / 2),
                 0.0,
                 0.0,

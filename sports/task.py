@@ -98,6 +98,19 @@ def falling_forces(foot_links: Sequence[bool]) -> list[float]:
 
 
 @dataclass
+class Move:
+    """What the sport itself puts elsewhere in mid-episode: a new serve, a ball dropped where it
+    went out, an athlete put back on its feet. See :func:`place_object`."""
+
+    mask: Tensor
+    """(N,) bool, the worlds in which something moves."""
+    qpos: Tensor
+    """(N, nq) the whole state; rows of other worlds are not used."""
+    qvel: Tensor
+    """(N, nv)"""
+
+
+@dataclass
 class Advance:
     """What a control step meant in the sport."""
 
@@ -105,13 +118,16 @@ class Advance:
     terms: dict[str, Tensor]
     """Reward terms by name, each (N, A); their sum is the reward."""
     terminated: Tensor
-    """(N,) the episode ended in the sport: no bootstrap."""
+    """(N, A) whose episode ended in the sport: no bootstrap. The world begins anew when any
+    athlete's ended; for the others it was cut off."""
     metrics: dict[str, Tensor]
     """(N,) episode metrics so far; NaN where undefined; read where the episode ended."""
     success: Tensor
     """(N,) bool, meaningful where terminated: promotes the curriculum."""
     remaining_paid: Tensor | None = None
     """(N,) bool: pay this step's reward for the steps left (outcome decided early)."""
+    move: Move | None = None
+    """Done after the step, before it is observed; not where the world begins anew."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +168,61 @@ class Task:
     """Whether training starts episodes' truncation clocks at random ages."""
     summary: str = ""
     notes: Mapping[str, str] = field(default_factory=dict)
+
+
+def place_object(
+    view: View,
+    mask: Tensor,
+    name: str,
+    pos: Tensor,
+    linvel: Tensor,
+    quat: Tensor | None = None,
+    angvel: Tensor | None = None,
+    onto: Move | None = None,
+) -> Move:
+    """Puts a free object elsewhere where ``mask`` (N,) is true.
+
+    ``pos``, ``linvel`` (N, 3) world frame; ``quat`` (N, 4), upright by default; ``angvel`` (N, 3)
+    in the object's own frame, zero by default. ``onto``: what else moves.
+    """
+    physics, scene = view.physics, view.physics.scene
+    q, v = scene.object_qpos(name), scene.object_qvel(name)
+    qpos = onto.qpos if onto is not None else physics.qpos.clone()
+    qvel = onto.qvel if onto is not None else physics.qvel.clone()
+    if quat is None:
+        quat = constant((1.0, 0.0, 0.0, 0.0), pos.device).expand(len(pos), 4)
+    spin = torch.zeros_like(linvel) if angvel is None else angvel
+    row = mask[:, None]
+    qpos[:, q] = torch.where(row, torch.cat((pos, quat), -1), qpos[:, q])
+    qvel[:, v] = torch.where(row, torch.cat((linvel, spin), -1), qvel[:, v])
+    return Move(mask if onto is None else mask | onto.mask, qpos, qvel)
+
+
+def place_athlete(
+    view: View,
+    mask: Tensor,
+    agent: int,
+    x: Tensor,
+    y: Tensor,
+    yaw: Tensor,
+    onto: Move | None = None,
+) -> Move:
+    """Puts an athlete on its feet, at rest in its start pose, where ``mask`` (N,) is true: at
+    ``x``, ``y`` (N,), facing ``yaw`` (N,) about +z (rad). ``onto``: what else moves."""
+    physics, scene = view.physics, view.physics.scene
+    q, v = scene.agent_qpos(agent), scene.agent_qvel(agent)
+    qpos = onto.qpos if onto is not None else physics.qpos.clone()
+    qvel = onto.qvel if onto is not None else physics.qvel.clone()
+    pose = constant(tuple(scene.default_qpos()[q].tolist()), x.device)
+    zero = torch.zeros_like(x)
+    root = torch.stack(
+        (x, y, zero + pose[2], (0.5 * yaw).cos(), zero, zero, (0.5 * yaw).sin()), dim=-1
+    )
+    standing = torch.cat((root, pose[7:].expand(len(x), -1)), -1)
+    row = mask[:, None]
+    qpos[:, q] = torch.where(row, standing, qpos[:, q])
+    qvel[:, v] = qvel[:, v].masked_fill(row, 0.0)
+    return Move(mask if onto is None else mask | onto.mask, qpos, qvel)
 
 
 @cache

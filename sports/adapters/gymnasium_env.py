@@ -90,7 +90,8 @@ class OlympicsEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """One control step (1/30 s). Raises ValueError for an action that is none."""
         result = _step(self.env, np.asarray(action)[None])
         diverged = not bool(result.valid[0])
-        terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0]) or diverged
+        terminated, truncated = bool(result.terminated[0, 0]), bool(result.truncated[0, 0])
+        truncated |= diverged
         info: dict[str, Any] = {}
         if terminated or truncated:
             info["metrics"] = {k: float(v[0]) for k, v in result.metrics.items()}
@@ -138,8 +139,8 @@ class OlympicsVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """One control step (1/30 s) of actions (N, act). Raises ValueError for what is none."""
         result = _step(self.env, actions)
         diverged = ~result.valid.cpu().numpy()
-        terminated = result.terminated.cpu().numpy()
-        truncated = result.truncated.cpu().numpy() | diverged
+        terminated = result.terminated[:, 0].cpu().numpy()
+        truncated = result.truncated[:, 0].cpu().numpy() | diverged
         ended, infos = terminated | truncated, {}
         if ended.any():
             final_obs = np.full(self.num_envs, None, dtype=object)

@@ -3,8 +3,8 @@
 Gains act as ``stiffness = position servo limited to +-effort``, ``damping = passive joint
 damping``: a clamped damper inside the actuator stops damping and explodes (measured). Contact
 forces come from contact sensors (``netforce``): one per athlete link against the ground, then
-one per named pair of the scene; then each athlete's ``WHOLE_SENSORS``. Three numbers each, world
-frame.
+one per named pair of the scene, then (``Scene.link_contacts``) one per link against everything;
+then each athlete's ``WHOLE_SENSORS``. Three numbers each, world frame.
 
 Contacts of athletes and ground yield to load (``CONTACT_IMPEDANCE``). With MuJoCo's default of
 0.9-0.95 a foot that has sunk in on impact is driven out again whatever it carries, so the ground
@@ -41,7 +41,7 @@ _SOLID, _GROUND = 1, 2
 
 
 def body_name(agent: int, link: str) -> str:
-    """Name of a link's body in the MuJoCo model."""
+    """Name of a link's body in the MuJoCo model; ``:k`` after it is the geom of its shape k."""
     return f"agent{agent}/{link}"
 
 
@@ -66,10 +66,11 @@ def _add_agent(spec: mujoco.MjSpec, scene: Scene, agent: int) -> None:
         bodies[link.name] = node
         if link.parent is None:
             node.add_freejoint(name=f"agent{agent}/root")
-        for shape in link.shapes:
+        for k, shape in enumerate(link.shapes):
             _add_shape(
                 node,
                 shape,
+                name=f"{body_name(agent, link.name)}:{k}",
                 friction=(friction, 0.005, 0.0001),
                 contype=_SOLID,
                 conaffinity=_SOLID | _GROUND,
@@ -123,6 +124,8 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
 
 
 def _side(scene: Scene, name: str) -> tuple[mujoco.mjtObj, str]:
+    if ":" in name:
+        return mujoco.mjtObj.mjOBJ_GEOM, name
     if "/" in name:
         return mujoco.mjtObj.mjOBJ_BODY, name
     if name.startswith("agent"):
@@ -138,15 +141,15 @@ WHOLE_SENSORS = (
 
 
 def _add_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
-    def add(name: str, a: tuple[mujoco.mjtObj, str], b: tuple[mujoco.mjtObj, str]) -> None:
+    def add(name: str, a: tuple[mujoco.mjtObj, str], b: tuple[mujoco.mjtObj, str] | None) -> None:
         # MuJoCo reports the force on the second object: our first side, world frame.
+        other = {"objtype": b[0], "objname": b[1]} if b is not None else {}
         sensor = spec.add_sensor(
             name=name,
             type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=b[0],
-            objname=b[1],
             reftype=a[0],
             refname=a[1],
+            **other,
         )
         sensor.intprm[:3] = (_FORCE_DATA, _NETFORCE, 1)
 
@@ -157,6 +160,11 @@ def _add_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
             add(f"ground:{name}", (mujoco.mjtObj.mjOBJ_BODY, name), ground)
     for a, b in scene.contact_pairs:
         add(f"pair:{a}:{b}", _side(scene, a), _side(scene, b))
+    if scene.link_contacts:
+        for agent in range(scene.num_agents):
+            for link in scene.body.link_names:
+                name = body_name(agent, link)
+                add(f"all:{name}", (mujoco.mjtObj.mjOBJ_BODY, name), None)
     for agent in range(scene.num_agents):
         root = body_name(agent, scene.body.links[0].name)
         for kind in WHOLE_SENSORS:

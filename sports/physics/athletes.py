@@ -605,25 +605,36 @@ def show_numbers(rows: np.ndarray, columns: np.ndarray, limit: float, bad: np.nd
 
 @compiled
 def look_at_contacts(
-    sensors: np.ndarray, peak: np.ndarray, ground: np.ndarray, pairs: np.ndarray, beyond: float
+    sensors: np.ndarray,
+    peak: np.ndarray,
+    ground: np.ndarray,
+    pairs: np.ndarray,
+    others: np.ndarray,
+    beyond: float,
 ) -> None:
     """Keeps the contact forces of a substep that are larger than in those before it.
 
-    ``sensors`` (N, >= 3 k): first those of the links, then those of the pairs. ``peak`` (N, k)
-    largest squares so far, ``ground`` (3, links, N), ``pairs`` (P, N). Squares from ``beyond`` on
-    are no forces.
+    ``sensors`` (N, >= 3 k): first those of the links and the ground, then those of the pairs, then
+    those of the links and everything. ``peak`` (N, k) largest squares so far, ``ground`` and
+    ``others`` (3, links, N), ``pairs`` (P, N). Squares from ``beyond`` on are no forces.
     """
-    links = ground.shape[1]
+    links, known = ground.shape[1], ground.shape[1] + len(pairs)
     for w in range(len(peak)):
         for i in range(peak.shape[1]):
             x, y, z = sensors[w, 3 * i], sensors[w, 3 * i + 1], sensors[w, 3 * i + 2]
+            if i >= known:  # all but the ground
+                j = 3 * (i - known)
+                x, y, z = x - sensors[w, j], y - sensors[w, j + 1], z - sensors[w, j + 2]
             square = x * x + y * y + z * z
             if peak[w, i] < square < beyond:
                 peak[w, i] = square
                 if i < links:
                     ground[0, i, w], ground[1, i, w], ground[2, i, w] = x, y, z
-                else:
+                elif i < known:
                     pairs[i - links, w] = math.sqrt(square)
+                else:
+                    k = i - known
+                    others[0, k, w], others[1, k, w], others[2, k, w] = x, y, z
 
 
 # Points on the links' surfaces.
@@ -703,8 +714,10 @@ def find_lowest(
 
 
 @compiled
-def copy_worlds(rows: np.ndarray, worlds: np.ndarray, columns: np.ndarray) -> None:
-    """Makes some columns of (k, N), by index, those rows of (N, k)."""
+def copy_worlds(
+    rows: np.ndarray, chosen: np.ndarray, worlds: np.ndarray, columns: np.ndarray
+) -> None:
+    """Makes some columns of (k, N), by index, chosen rows of (M, k)."""
     for j in range(len(columns)):
-        for w in worlds:
-            columns[j, w] = rows[w, j]
+        for i in range(len(worlds)):
+            columns[j, worlds[i]] = rows[chosen[i], j]

@@ -70,6 +70,9 @@ class Physics(Protocol):
     ground_force: Tensor
     """(N, A, B, 3) force of the ground on each link, world frame, in that substep of the last
     control step in which it was largest; zero where the link never touched."""
+    link_force: Tensor
+    """(N, A, B, 3) the same of everything but the ground, where ``Scene.link_contacts`` asks for
+    it; else no worlds (0, A, B, 3)."""
     pair_force: Tensor
     """(N, P) largest net contact force over the substeps between the scene's named pairs."""
     object_pos: Tensor
@@ -98,6 +101,12 @@ class Physics(Protocol):
         Kinematic tensors are current afterwards in every world; contact forces are zero in the
         reset ones.
         """
+        ...
+
+    def move(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        """Changes states in mid-episode where ``mask`` (N,) is true, to rows of ``qpos`` (N, nq)
+        and ``qvel`` (N, nv). What a row leaves as it is goes on undisturbed; kinematic tensors are
+        current afterwards, contact forces remain those of the last step."""
         ...
 
     def extent(self, direction: Tensor) -> Tensor:

@@ -121,6 +121,7 @@ class DrakePhysics:
         self._lin, self._ang = np.zeros((n, bodies, 3)), np.zeros((n, bodies, 3))
         self._ground = np.zeros((n, agents * links, 3))
         self._pair = np.zeros((n, len(scene.contact_pairs)))
+        self._others = np.zeros((n * scene.link_contacts, agents * links, 3))
         self.bad = torch.zeros(n, dtype=torch.bool)
         self.nan_worlds = 0
         self.overflow = 0  # Drake has no contact buffers to overflow.
@@ -155,6 +156,12 @@ class DrakePhysics:
             self._place(world, qpos[world], qvel[world], mocap[world])
         self._publish()
 
+    def move(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        forces = self._ground.copy(), self._pair.copy(), self._others.copy()
+        self.reset(mask, PhysicsState(qpos, qvel, self.mocap_pos))
+        self._ground, self._pair, self._others = forces
+        self._publish()
+
     def extent(self, direction: Tensor) -> Tensor:
         return self.geometry.extent(self.body_pos, self.body_quat, direction)
 
@@ -165,8 +172,8 @@ class DrakePhysics:
 
     def _step_world(self, world: int, targets: np.ndarray) -> bool:
         """Advances one control step; False if the solver failed or the state is not finite."""
-        self._ground[world] = 0.0
-        self._pair[world] = 0.0
+        for forces in (self._ground, self._pair, self._others):
+            forces[world : world + 1] = 0.0
         if not np.isfinite(targets).all():
             return False
         root, context = self._roots[world], self._contexts[world]
@@ -206,19 +213,25 @@ class DrakePhysics:
                 X_WF = RigidTransform(Quaternion(np.array(obj.quat)), mocap[row])
                 obj.frame.SetPoseInParentFrame(context, X_WF)
         self._mocap[world] = mocap
-        self._ground[world] = 0.0
-        self._pair[world] = 0.0
+        for forces in (self._ground, self._pair, self._others):
+            forces[world : world + 1] = 0.0
 
     def _index_contacts(self) -> None:
         """Tables from Drake's body indices to links and to the scene's pairs."""
         names: dict[str, list[int]] = {}
         self._link_of: dict[int, int] = {}
+        self._shape_of: dict[GeometryId, int] = {}
         for a, humanoid in enumerate(self._humanoids):
             for i, link in enumerate(humanoid.links):
                 index = int(link.index())
                 self._link_of[index] = a * self.scene.body.num_links + i
                 names.setdefault(f"agent{a}", []).append(index)
-                names[f"agent{a}/{self.scene.body.link_names[i]}"] = [index]
+                name = f"agent{a}/{self.scene.body.link_names[i]}"
+                names[name] = [index]
+                for k, shape in enumerate(humanoid.shapes[i]):
+                    # A shape of its own gets a number that no body has.
+                    names[f"{name}:{k}"] = [-1 - len(self._shape_of)]
+                    self._shape_of[shape] = names[f"{name}:{k}"][0]
         for obj in [*self._free, *self._fixtures]:
             names[obj.name] = [int(obj.rigid.index())]
         self._pairs_of: dict[tuple[int, int], list[tuple[int, float]]] = {}
@@ -239,6 +252,7 @@ class DrakePhysics:
             return
         ground: dict[int, np.ndarray] = {}
         pairs: dict[int, np.ndarray] = {}
+        others: dict[int, np.ndarray] = {}
         for i in range(count):
             info = results.point_pair_contact_info(i)
             body_a, body_b = int(info.bodyA_index()), int(info.bodyB_index())
@@ -249,12 +263,21 @@ class DrakePhysics:
             elif body_b == 0 and body_a in self._link_of:
                 link = self._link_of[body_a]
                 ground[link] = ground.get(link, 0.0) - f_Bc_W
-            for k, sign in self._pairs_of.get((body_a, body_b), ()):
-                pairs[k] = pairs.get(k, 0.0) + sign * f_Bc_W
-        kept = self._ground[world]
-        for link, force in ground.items():
-            if force @ force > kept[link] @ kept[link]:
-                kept[link] = force
+            elif self.scene.link_contacts:
+                for body, force in ((body_b, f_Bc_W), (body_a, -f_Bc_W)):
+                    link = self._link_of.get(body)
+                    if link is not None:
+                        others[link] = others.get(link, 0.0) + force
+            met = info.point_pair()
+            sides_a = body_a, self._shape_of.get(met.id_A, body_a)
+            sides_b = body_b, self._shape_of.get(met.id_B, body_b)
+            for sides in dict.fromkeys((a, b) for a in sides_a for b in sides_b):
+                for k, sign in self._pairs_of.get(sides, ()):
+                    pairs[k] = pairs.get(k, 0.0) + sign * f_Bc_W
+        for kept, found in ((self._ground, ground), (self._others, others)):
+            for link, force in found.items():
+                if force @ force > kept[world, link] @ kept[world, link]:
+                    kept[world, link] = force
         for k, force in pairs.items():
             self._pair[world, k] = np.maximum(self._pair[world, k], np.linalg.norm(force))
 
@@ -316,6 +339,7 @@ class DrakePhysics:
         self.body_angvel, self.object_angvel = ang[:, :k].view(n, agents, links, 3), ang[:, k:]
         self.mocap_pos = tensor(self._mocap)
         self.ground_force = tensor(self._ground).view(n, agents, links, 3)
+        self.link_force = tensor(self._others).view(-1, agents, links, 3)
         self.pair_force = tensor(self._pair)
 
 

@@ -56,6 +56,7 @@ class MujocoPhysics:
         self.object_pos, self.object_quat = shown.object_pos, shown.object_quat
         self.object_linvel, self.object_angvel = shown.object_linvel, shown.object_angvel
         self.ground_force, self.pair_force = shown.ground_force, shown.pair_force
+        self.link_force = shown.link_force
         self.bad = torch.from_numpy(out.bad)
         self.nan_worlds = 0
         self.overflow = 0
@@ -85,6 +86,11 @@ class MujocoPhysics:
         ids = worlds.numpy()
         self._out.put(ids, prepared.results)
         self._worlds.take(ids)
+
+    def move(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        worlds = mask.nonzero()[:, 0]
+        if worlds.numel():
+            self._worlds.move(worlds.numpy(), qpos[worlds].numpy(), qvel[worlds].numpy())
 
     def extent(self, direction: Tensor) -> Tensor:
         return self.geometry.extent(self.body_pos, self.body_quat, direction)

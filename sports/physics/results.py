@@ -56,6 +56,7 @@ class Results:
             "whole": (6, agents),
             "ground_force": (3, agents * links),
             "pair_force": (len(scene.contact_pairs),),
+            "link_force": (3, agents * links * scene.link_contacts),
         }
         for kind, number in (("links", (agents, links)), ("objects", (objects,))):
             shapes |= {f"{kind}.{f.name}": (_SIZES[f.name], *number) for f in fields(Motion)}
@@ -87,7 +88,8 @@ class Results:
         """(3, A B, N) as ``Physics.ground_force``"""
         self.pair_force = parts["pair_force"]
         """(P, N) as ``Physics.pair_force``"""
-
+        self.link_force = parts["link_force"]
+        """(3, A B, N) as ``Physics.link_force``; (3, 0, N) where nobody asks for it."""
         self.bad = np.zeros(num_worlds, np.bool_)
         """(N,) bool: the numbers of the state are those of ``sports.physics.base.diverged``."""
 
@@ -96,10 +98,12 @@ class Results:
         """(N, ...) a copy with the worlds first, quick to pick a few from."""
         return np.ascontiguousarray(self._all.T)
 
-    def put(self, worlds: np.ndarray, source: Results) -> None:
-        """Makes worlds, by index, those of other results that do not change any more."""
-        copy_worlds(source.by_world, worlds, self._all)
-        self.felt[worlds] = source.felt[worlds]
+    def put(self, worlds: np.ndarray, source: Results, chosen: np.ndarray | None = None) -> None:
+        """Makes worlds, by index, those of other results that do not change any more: the same
+        ones or ``chosen`` ones."""
+        chosen = worlds if chosen is None else chosen
+        copy_worlds(source.by_world, chosen, worlds, self._all)
+        self.felt[worlds] = source.felt[chosen]
 
     def athlete(self, agent: int) -> Athlete:
         """What is shown of an athlete; views."""
@@ -141,9 +145,16 @@ class Shown:
         agents = (scene.num_agents, scene.body.num_links)
         self.ground_force = _turned(results.ground_force).unflatten(1, agents)
         self.pair_force = torch.from_numpy(results.pair_force).T
+        others = _turned(results.link_force)
+        self.link_force = others.unflatten(1, agents) if scene.link_contacts else none(agents)
 
     def extent(self, direction: Tensor) -> Tensor:
         return self.geometry.extent(self.body_pos, self.body_quat, direction)
+
+
+def none(agents: tuple[int, int]) -> Tensor:
+    """(0, A, B, 3) the ``link_force`` that nobody asked for."""
+    return torch.zeros(0, *agents, 3)
 
 
 def _turned(array: np.ndarray) -> Tensor:

@@ -39,9 +39,11 @@ def _sum_contacts(
     side_a: wp.array2d(dtype=int),  # type: ignore[valid-type]
     side_b: wp.array2d(dtype=int),  # type: ignore[valid-type]
     num_links: int,
+    others: int,
     forces: wp.array3d(dtype=float),  # type: ignore[valid-type]
 ):
-    """Adds each contact's force (on its second geom, world frame) to its link and pairs."""
+    """Adds each contact's force (on its second geom, world frame) to its link and pairs, and
+    from slot ``others`` on (if positive) to links that met something else than the ground."""
     i = wp.tid()
     if i >= count[0]:
         return
@@ -56,6 +58,12 @@ def _sum_contacts(
     if second == -2 and first >= 0:
         for k in range(3):
             wp.atomic_add(forces, world, first, k, -f[k])
+    if others > 0 and first != -2 and second != -2:
+        for k in range(3):
+            if second >= 0:
+                wp.atomic_add(forces, world, others + second, k, f[k])
+            if first >= 0:
+                wp.atomic_add(forces, world, others + first, k, -f[k])
     for p in range(side_a.shape[1]):
         if side_b[pair[0], p] == 1 and side_a[pair[1], p] == 1:
             for k in range(3):
@@ -190,14 +198,18 @@ def _contact_tables(
         for i, link in enumerate(scene.body.link_names)
     }
     names = [model.body(model.geom_bodyid[g]).name for g in range(model.ngeom)]
+    geoms = [model.geom(g).name for g in range(model.ngeom)]
     geom_link = np.array([links.get(name, -1) for name in names], dtype=np.int32)
     geom_link[model.geom(GROUND).id] = -2
 
     def member(side: int) -> np.ndarray:
         table = np.zeros((model.ngeom, len(scene.contact_pairs)), dtype=np.int32)
         for p, pair in enumerate(scene.contact_pairs):
-            whole = f"{pair[side]}/"
-            table[:, p] = [n == pair[side] or n.startswith(whole) for n in names]
+            one, whole = pair[side], f"{pair[side]}/"
+            if ":" in one:
+                table[:, p] = [geom == one for geom in geoms]
+            else:
+                table[:, p] = [n == one or n.startswith(whole) for n in names]
         return table
 
     return geom_link, member(0), member(1)
@@ -274,7 +286,9 @@ class WarpPhysics:
         self._split, self._shape = k, (agents, links)
 
         geom_link, side_a, side_b = _contact_tables(scene, model)
-        sensors = k + len(scene.contact_pairs)
+        pairs = len(scene.contact_pairs)
+        sensors = k + pairs + k * scene.link_contacts
+        self._others = k + pairs if scene.link_contacts else 0
         with wp.ScopedDevice(self._wp_device):
             self._geom_link = wp.array(geom_link, dtype=int)
             self._side_a = wp.array(side_a, dtype=int)
@@ -299,6 +313,10 @@ class WarpPhysics:
         self._wp_forces = wp.from_torch(self._forces)
         self._wp_largest = wp.from_torch(self._largest)
         self.ground_force = self._forces[:, :k].unflatten(1, (agents, links))
+        self.link_force = torch.zeros(0, agents, links, 3, device=self.device)
+        if scene.link_contacts:
+            self.link_force = self._forces[:, k + pairs :].unflatten(1, (agents, links))
+        self._pairs = slice(k, k + pairs)
         self.bad = torch.zeros(n, dtype=torch.bool, device=self.device)
         self.nan_worlds = torch.zeros((), dtype=torch.long, device=self.device)
         self.overflow = torch.zeros((), dtype=torch.long, device=self.device)
@@ -339,6 +357,17 @@ class WarpPhysics:
             self.mocap_pos.copy_(torch.where(row[..., None], state.mocap_pos, self.mocap_pos))
         self._forces.masked_fill_(row[..., None], 0.0)
         self._known.masked_fill_(row, 0)
+        self._run(self._refresh_graph, self._refresh)
+        self._derive()
+
+    def move(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
+        row = mask[:, None]
+        for agent in range(self.scene.num_agents):
+            q, v = self.scene.agent_qpos(agent), self.scene.agent_qvel(agent)
+            moved = (qpos[:, q] != self.qpos[:, q]).any(1) | (qvel[:, v] != self.qvel[:, v]).any(1)
+            self._known[:, agent].masked_fill_(moved & mask, 0)
+        self.qpos.copy_(torch.where(row, qpos, self.qpos))
+        self.qvel.copy_(torch.where(row, qvel, self.qvel))
         self._run(self._refresh_graph, self._refresh)
         self._derive()
 
@@ -407,6 +436,7 @@ class WarpPhysics:
                     self._side_a,
                     self._side_b,
                     self._split,
+                    self._others,
                 ],
                 outputs=[self._now],
             )
@@ -473,4 +503,4 @@ class WarpPhysics:
         self.body_linvel = linear[:, :k].unflatten(1, self._shape)
         self.body_angvel = spin[:, :k].unflatten(1, self._shape)
         self.object_linvel, self.object_angvel = linear[:, k:], spin[:, k:]
-        self.pair_force = self._forces[:, k:].norm(dim=-1)
+        self.pair_force = self._forces[:, self._pairs].norm(dim=-1)

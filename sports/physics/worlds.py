@@ -48,7 +48,8 @@ class Worlds:
         ]
         self._athletes = [out.athlete(agent) for agent in range(scene.num_agents)]
         self._constraint, self._sensors = batch.bind("qfrc_constraint"), batch.bind("sensordata")
-        self._peaks = np.zeros((n, out.ground_force.shape[1] + len(out.pair_force)))
+        sensors = out.ground_force.shape[1] + len(out.pair_force) + out.link_force.shape[1]
+        self._peaks = np.zeros((n, sensors))
         self._timesteps: list[np.ndarray] | None = None
         self._softness = model.geom_solref, model.geom_solimp
         if drawn is not None:
@@ -61,14 +62,16 @@ class Worlds:
         """One control step with targets (n, nu). Whether some world has diverged."""
         out = self._out
         self._ctrl[:] = ctrl
-        self._peaks[:] = out.ground_force[:] = out.pair_force[:] = 0.0
+        forces = out.ground_force, out.pair_force, out.link_force
+        for array in (self._peaks, *forces):
+            array[:] = 0.0
         for i in range(self.scene.substeps):
             if self._timesteps is not None:
                 self._timestep[:] = self._timesteps[i].reshape(self._timestep.shape)
                 for keeper in self.keepers:
                     keeper.kept.timestep[:] = self._timesteps[i]
             self.batch.step()
-            look_at_contacts(self._sensors, self._peaks, out.ground_force, out.pair_force, TOO_MUCH)
+            look_at_contacts(self._sensors, self._peaks, *forces, TOO_MUCH)
             if i < self.scene.substeps - 1:
                 for keeper in self.keepers:
                     keeper.correct(current=False)
@@ -84,6 +87,23 @@ class Worlds:
             self._mocap[ids, row] = self._out.mocap_pos[k][:, ids].T
         for keeper in self.keepers:
             keeper.forget(ids)
+
+    def move(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Changes the states of worlds ``ids`` to (n, nq), (n, nv), float32, where they differ
+        from what is shown."""
+        scene, out = self.scene, self._out
+        changed_q, changed_v = qpos != out.qpos[:, ids].T, qvel != out.qvel[:, ids].T
+        self.qpos[ids] = np.where(changed_q, qpos, self.qpos[ids])
+        self.qvel[ids] = np.where(changed_v, qvel, self.qvel[ids])
+        for agent, keeper in enumerate(self.keepers):
+            moved = changed_q[:, scene.agent_qpos(agent)].any(1)
+            moved |= changed_v[:, scene.agent_qvel(agent)].any(1)
+            keeper.forget(ids[moved])
+        some = Results(scene, len(ids))
+        show(scene, self._trees, self.qpos[ids], self.qvel[ids], some)
+        for name in ("mocap_pos", "ground_force", "pair_force", "link_force"):
+            getattr(some, name)[:] = getattr(out, name)[..., ids]
+        out.put(ids, some, np.arange(len(ids)))
 
     def show(self) -> None:
         """Shows a state that was set from outside."""

@@ -41,7 +41,7 @@ def test_bare_physics_and_environment_take_the_same_steps(meter: Meter) -> None:
     def counted_env(action: torch.Tensor):
         before, clock = env.physics.extra_state()["qpos"].numpy(), env.view.clock.clone()
         result = env_step(action)
-        ended = result.terminated | result.truncated | ~result.valid
+        ended = result.ended | ~result.valid
         assert (env.view.clock == torch.where(ended, 0, clock + 1)).all()
         went.append((before, env.physics.extra_state()["qpos"].numpy(), ~ended.numpy()))
         return result

@@ -32,8 +32,8 @@ class Noise:
             obs=self.observe(),
             final_obs=self.observe(),
             reward=action.square().sum(-1),
-            terminated=kind < 0.01,
-            truncated=(kind > 0.01) & (kind < 0.02),
+            terminated=(kind < 0.01)[:, None],
+            truncated=((kind > 0.01) & (kind < 0.02))[:, None],
             valid=kind < 0.999,
             remaining_paid=torch.zeros(n, device=self.device),
         )

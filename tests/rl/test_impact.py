@@ -14,7 +14,7 @@ from sports.env import make_env
 
 def ended(n: int, valid: bool = True) -> SimpleNamespace:
     no = torch.zeros(n, dtype=torch.bool)
-    return SimpleNamespace(terminated=no.clone(), truncated=no.clone(), valid=no | valid)
+    return SimpleNamespace(ended=no.clone(), valid=no | valid)
 
 
 def test_only_the_excess_of_each_link_is_paid_for_and_never_a_reset_world():
@@ -26,7 +26,7 @@ def test_only_the_excess_of_each_link_is_paid_for_and_never_a_reset_world():
     scene = SimpleNamespace(body=SimpleNamespace(mass=1.0 / 9.81))
     physics = SimpleNamespace(ground_force=force, scene=scene)
     result = ended(4)
-    result.terminated[2] = True
+    result.ended[2] = True
     result.valid[3] = False
     cost = ImpactCost(SimpleNamespace(physics=physics), weight=0.5, limit=3.0)(result)
     assert cost[:, 0].tolist() == pytest.approx([-0.5 * (2.0 + 30.0), 0.0, 0.0, 0.0])

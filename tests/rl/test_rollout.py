@@ -94,8 +94,8 @@ class Scripted:
             final_obs=n + 100.0,
             reward=torch.tensor([[1.0, 2.0], [3.0, float("nan")]]),
             terms={},
-            terminated=torch.tensor([True, False]),
-            truncated=torch.tensor([False, False]),
+            terminated=torch.tensor([[True, False], [False, False]]),
+            truncated=torch.tensor([[False, True], [False, False]]),
             valid=torch.tensor([True, False]),
             remaining_paid=torch.tensor([2.0, 5.0]),
             metrics={},
@@ -116,9 +116,11 @@ def test_collect_keeps_agents_apart_and_divides_by_the_reward_scale():
     assert rollout.obs[0, :, 0].tolist() == [0.0, 1.0, 2.0, 3.0]
     assert rollout.final_obs[0, :, 0].tolist() == [100.0, 101.0, 102.0, 103.0]
     assert after[1, 1, 0] == 203.0
-    # world 0: two more steps paid, 1 + 0.5 + 0.25; world 1 is invalid: no NaN gets in
-    torch.testing.assert_close(rollout.reward[0], torch.tensor([0.175, 0.35, 0.0, 0.0]))
-    assert rollout.terminated[0].tolist() == [True, True, False, False]
+    # world 0: two more steps paid, 1 + 0.5 + 0.25, to the agent whose episode ended;
+    # world 1 is invalid: no NaN gets in
+    torch.testing.assert_close(rollout.reward[0], torch.tensor([0.175, 0.2, 0.0, 0.0]))
+    assert rollout.terminated[0].tolist() == [True, False, False, False]
+    assert rollout.truncated[0].tolist() == [False, True, False, False]
     assert rollout.valid[0].tolist() == [True, True, False, False]
 
 

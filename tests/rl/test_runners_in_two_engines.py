@@ -31,7 +31,7 @@ def sprint() -> tuple[PhysicsState, Tensor]:
         action = policy(obs).clamp(-1.0, 1.0)
         targets.append((action * env.action_scale).flatten(1))
         result = env.step(action)
-        running &= ~(result.terminated | result.truncated)
+        running &= ~result.ended
         obs = result.obs
     mocap = physics.mocap_pos[running].repeat(len(MOMENTS), 1, 1)
     env.close()

@@ -45,7 +45,7 @@ def test_worlds_go_as_those_of_the_environment():
         result = plain.step(torch.from_numpy(action)[:, None])
         np.testing.assert_array_equal(obs, result.obs[:, 0].numpy())
         np.testing.assert_array_equal(reward, result.reward[:, 0].double().numpy())
-        np.testing.assert_array_equal(terminated, result.terminated.numpy())
+        np.testing.assert_array_equal(terminated, result.terminated[:, 0].numpy())
         ended = terminated | truncated
         ends += int(ended.sum())
         assert ("final_obs" in info) == bool(ended.any())

@@ -414,11 +414,12 @@ def test_every_episode_starts_as_the_first():
     for action in actions:
         result = env.step(action)
         falls += int(result.terminated.sum())
-        assert torch.equal(result.obs[result.terminated], first[result.terminated])
-        assert torch.equal(result.obs[~result.terminated], result.final_obs[~result.terminated])
-        assert (env.view.clock[result.terminated] == 0).all()
+        over = result.ended
+        assert torch.equal(result.obs[over], first[over])
+        assert torch.equal(result.obs[~over], result.final_obs[~over])
+        assert (env.view.clock[over] == 0).all()
         result = noisy.step(action)
-        starts += list(result.obs[result.terminated].flatten(1))
+        starts += list(result.obs[result.ended].flatten(1))
     assert falls >= 6 and len(starts) >= 6
     starts = torch.stack(starts)
     assert (torch.cdist(starts, starts) + 10 * torch.eye(len(starts)) > 0.05).all()
