@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from sports import high_jump, long_jump
+from sports.humanoid.body import load_body
 from sports.task import Task
 
 _TASKS: dict[str, Task] = {t.name: t for t in (high_jump.TASK, long_jump.TASK)}
@@ -21,6 +22,12 @@ def get_task(name: str) -> Task:
     if name not in _TASKS:
         raise ValueError(f"unknown task '{name}'; known: {', '.join(_TASKS)}")
     return _TASKS[name]
+
+
+def num_agents(name: str) -> int:
+    """Athletes in a world of that task."""
+    task = get_task(name)
+    return task.scene(task.config(), load_body(task.body, equipment=task.equipment)).num_agents
 
 
 def make_config(task: Task, options: dict[str, Any] | None = None) -> Any:

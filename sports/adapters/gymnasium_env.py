@@ -19,44 +19,24 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sports.env import Env, StepResult, make_env
-from sports.registry import task_names
+from sports.adapters.episodes import begin, checked, play, title
+from sports.env import Env, make_env
+from sports.registry import num_agents, task_names
 
 
 def _make(task: str, num_worlds: int, settings: dict[str, Any]) -> Env:
     env = make_env(task, num_worlds=num_worlds, **settings)
     if env.num_agents != 1:
         env.close()
-        raise ValueError(f"task '{task}' has {env.num_agents} athletes; Gymnasium knows one")
-    return env
-
-
-def _reset(env: Env, seed: int | None) -> np.ndarray:
-    """(N, obs) after a reset of every world; a seed decides all that follows."""
-    if seed is not None:
-        env.generator.manual_seed(seed)
-        if env.task.curriculum is not None:
-            env.view.curriculum = env.task.curriculum(env.config, env.num_worlds, env.device)
-    obs = env.reset()
-    env.age.zero_()  # ages that differ are for training in many worlds: here episodes are whole
-    return obs[:, 0].cpu().numpy()
-
-
-def _step(env: Env, actions: np.ndarray) -> StepResult:
-    """Raises ValueError for actions (N, act) of another shape or that are not numbers."""
-    actions = np.asarray(actions, np.float32)
-    if actions.shape != (env.num_worlds, env.action_size):
         raise ValueError(
-            f"actions have shape {actions.shape}, expected {(env.num_worlds, env.action_size)}"
+            f"task '{task}' has {env.num_agents} athletes, Gymnasium knows one: use "
+            "sports.adapters.pettingzoo_env"
         )
-    if not np.isfinite(actions).all():
-        raise ValueError("an action is not a finite number")
-    return env.step(torch.from_numpy(actions).to(env.device)[:, None])
+    return env
 
 
 def _spaces(env: Env) -> tuple[spaces.Box, spaces.Box]:
@@ -84,11 +64,11 @@ class OlympicsEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """A new episode; observation (obs,)."""
         super().reset(seed=seed)
-        return _reset(self.env, seed)[0], {}
+        return begin(self.env, seed)[0, 0].cpu().numpy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One control step (1/30 s). Raises ValueError for an action that is none."""
-        result = _step(self.env, np.asarray(action)[None])
+        result = play(self.env, checked(action, (self.env.action_size,))[None, None])
         diverged = not bool(result.valid[0])
         terminated, truncated = bool(result.terminated[0, 0]), bool(result.truncated[0, 0])
         truncated |= diverged
@@ -131,13 +111,13 @@ class OlympicsVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if isinstance(seed, (list, tuple)):
             raise ValueError("one seed decides all worlds: give a number, not a list")
         super().reset(seed=seed)
-        return _reset(self.env, seed), {}
+        return begin(self.env, seed)[:, 0].cpu().numpy(), {}
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control step (1/30 s) of actions (N, act). Raises ValueError for what is none."""
-        result = _step(self.env, actions)
+        result = play(self.env, checked(actions, (self.num_envs, self.env.action_size))[:, None])
         diverged = ~result.valid.cpu().numpy()
         terminated = result.terminated[:, 0].cpu().numpy()
         truncated = result.truncated[:, 0].cpu().numpy() | diverged
@@ -165,8 +145,10 @@ class OlympicsVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 def _register() -> None:
     module = __name__
     for task in task_names():
+        if num_agents(task) != 1:
+            continue
         gymnasium.register(
-            id=f"olympics/{task.title().replace('_', '')}-v0",
+            id=f"olympics/{title(task)}-v0",
             entry_point=f"{module}:OlympicsEnv",
             vector_entry_point=f"{module}:OlympicsVectorEnv",
             kwargs={"task": task},

@@ -111,3 +111,18 @@ def test_the_example_of_the_readme_runs():
     exec(example.replace("num_envs=256", "num_envs=2"), found)
     assert found["obs"].shape == (2, found["envs"].single_observation_space.shape[0])
     found["envs"].close()
+
+
+def test_another_librarys_learner_learns_from_it():
+    """Two updates of Stable-Baselines3's PPO: samples counted, losses finite, weights changed."""
+    from stable_baselines3 import PPO
+
+    env = gymnasium.make("olympics/LongJump-v0", strength="human")
+    learner = PPO("MlpPolicy", env, n_steps=48, batch_size=24, n_epochs=2, seed=0, device="cpu")
+    before = [p.detach().clone() for p in learner.policy.parameters()]
+    learner.learn(96)
+    assert learner.num_timesteps == 96 and learner._n_updates == 4
+    after = list(learner.policy.parameters())
+    assert all(bool(p.isfinite().all()) for p in after)
+    assert any(not torch.equal(a, b) for a, b in zip(before, after))
+    env.close()
