@@ -4,6 +4,7 @@ as JSON.
 
 from __future__ import annotations
 
+import json
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -13,7 +14,9 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
-from olympics_opt.meter import SIGMA, STEPS, Row, measure
+from olympics_opt import meter
+from olympics_opt.meter import SIGMA, Row, measure
+from olympics_opt.soak import STEPS, soak
 from rl import provenance
 from sports.registry import get_task, task_names
 from warmstart.atomic import write_json
@@ -45,6 +48,10 @@ class BenchConfig:
     """Measure training too."""
     seed: int = 0
     """Seed of actions, starts and networks."""
+    soak: bool = False
+    """Instead of speed, measure endurance: random actions for many steps, and what goes wrong."""
+    steps: int = STEPS
+    """Control steps of an endurance run."""
 
 
 def bench(
@@ -97,7 +104,7 @@ def bench(
         "seed": seed,
         "seconds": seconds,
         "sigma": SIGMA,
-        "steps_per_turn": STEPS,
+        "steps_per_turn": meter.STEPS,
         "rows": [],
     }
     rows: list[Row] = []
@@ -130,6 +137,69 @@ def bench(
             write_json(out, result)
     console.print(_table(rows))
     console.print(f"{provenance.hardware()}; commit {provenance.commit()}; written to {out}")
+    return result
+
+
+def soak_all(
+    out: str | Path,
+    *,
+    engines: Sequence[str] = (),
+    tasks: Sequence[str] = (),
+    worlds: Sequence[int] = (),
+    steps: int = STEPS,
+    seed: int = 0,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Plays every task for a long time under random actions and writes what happened as JSON.
+
+    What the file holds of other tasks, engines and numbers of worlds stays: a soak of all tasks
+    takes hours and may be done in several goes. Each row says at which commit and on what it was
+    measured.
+
+    Arguments as of :func:`bench`; ``steps``: control steps of each world.
+
+    Raises:
+        ValueError: unknown task or engine, or counts that are not positive.
+        RuntimeError: an engine cannot run here.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    engines = tuple(engines) or ("warp" if torch.cuda.is_available() else "mujoco",)
+    tasks = tuple(tasks) or task_names()
+    for name in tasks:
+        get_task(name)
+    out, kept = Path(out), {}
+    if out.exists():
+        for row in json.loads(out.read_text()).get("soak", []):
+            kept[row["task"], row["engine"], row["worlds"]] = row
+    console, result = Console(quiet=quiet), {"soak": list(kept.values())}
+    with Progress(console=console, transient=True, disable=quiet) as progress:
+        for engine in engines:
+            for task in tasks:
+                for count in worlds or WORLDS.get(engine, (1,))[:1]:
+                    bar = progress.add_task(f"{task} on {engine}, {count} worlds", total=steps)
+
+                    def show(step: int, bar: Any = bar) -> None:
+                        progress.update(bar, completed=step)
+
+                    found = soak(task, engine, worlds=count, steps=steps, seed=seed, on_step=show)
+                    progress.remove_task(bar)
+                    kept[task, engine, count] = asdict(found) | {
+                        "clean": found.clean,
+                        "seed": seed,
+                        "commit": provenance.commit(),
+                        "hardware": provenance.hardware(),
+                    }
+                    result["soak"] = list(kept.values())
+                    write_json(out, result)
+                    console.print(
+                        f"{task} on {engine}: {'clean' if found.clean else 'NOT CLEAN'}; "
+                        f"{found.episodes} episodes, {found.nan_worlds} worlds diverged, "
+                        f"{found.overflow} overflowed, {found.bad_observations} and "
+                        f"{found.bad_rewards} numbers not finite, "
+                        f"{_rate(found.steps_per_second)} steps/s"
+                    )
     return result
 
 
@@ -181,6 +251,16 @@ def main(args: Sequence[str] | None = None) -> int:
     config = tyro.cli(
         Annotated[BenchConfig, tyro.conf.arg(name="")], args=args, prog="olympics-opt bench"
     )
+    if config.soak:
+        soak_all(
+            config.out,
+            engines=config.engine,
+            tasks=config.task,
+            worlds=config.worlds,
+            steps=config.steps,
+            seed=config.seed,
+        )
+        return 0
     bench(
         config.out,
         engines=config.engine,

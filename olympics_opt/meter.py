@@ -304,14 +304,14 @@ def measure(
         return Row(
             task=task,
             engine=engine,
-            device=_device_name(env.device),
+            device=device_name(env.device),
             worlds=env.num_worlds,
             timestep=env.physics.scene.timestep,
             substeps=env.physics.scene.substeps,
             turns=len(turns),
             **summary(turns),
             setup_s=setup,
-            host_memory_gib=_resident_gib(),
+            host_memory_gib=resident_gib(),
             device_memory_gib=device_memory,
             nan_worlds=int(env.physics.nan_worlds),
             overflow=int(env.physics.overflow),
@@ -344,10 +344,12 @@ def summary(turns: Sequence[dict[str, float]]) -> dict[str, Any]:
     }
 
 
-def _device_name(device: torch.device) -> str:
+def device_name(device: torch.device) -> str:
+    """What the machine calls it."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
 
 
-def _resident_gib() -> float:
+def resident_gib() -> float:
+    """Greatest resident memory of this process so far (GiB)."""
     scale = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * scale / 2**30

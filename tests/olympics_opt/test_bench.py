@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -13,6 +14,7 @@ import torch
 
 from olympics_opt import bench
 from olympics_opt.meter import Meter, measure, summary
+from olympics_opt.soak import soak
 from rl.ppo import PPOConfig
 from sports.env import make_env
 from sports.humanoid.mjcf import build_model
@@ -174,3 +176,34 @@ def test_bare_warp_is_mujoco() -> None:
             torch.testing.assert_close(value, before[name], rtol=0, atol=0, equal_nan=True)
     finally:
         env.close()
+
+
+def test_a_soak_counts_what_goes_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A task that gives NaN in one of its features now and then, and a reward that is infinite."""
+    from sports import long_jump, registry
+
+    def features(view, memory):
+        found = long_jump.features(view, memory)
+        late = (view.clock == 3)[:, None, None]
+        return found | {"goal": found["goal"].masked_fill(late, float("nan"))}
+
+    def advance(view, memory):
+        step = long_jump.advance(view, memory)
+        late = (view.clock == 5)[:, None]
+        step.terms["speed"] = step.terms["speed"].masked_fill(late, float("inf"))
+        return step
+
+    broken = replace(long_jump.TASK, name="broken", features=features, advance=advance)
+    monkeypatch.setitem(registry._TASKS, "broken", broken)
+    found = soak("broken", "mujoco", worlds=3, steps=6)
+    assert found.bad_observations == 3 * 3 and found.bad_rewards == 3 and not found.clean
+    out = tmp_path / "soak.json"
+    common = ["--soak", "--out", str(out), "--worlds", "2", "--steps", "40"]
+    assert bench.main([*common, "--task", "broken"]) == 0
+    assert bench.main([*common, "--task", "long_jump", "high_jump"]) == 0
+    rows = {row["task"]: row for row in json.loads(out.read_text())["soak"]}
+    assert list(rows) == ["broken", "long_jump", "high_jump"]
+    assert not rows["broken"]["clean"] and rows["high_jump"]["clean"]
+    assert rows["high_jump"]["episodes"] >= 2 and rows["high_jump"]["commit"]
+    with pytest.raises(ValueError, match="must be positive"):
+        soak("long_jump", "mujoco", worlds=0)
