@@ -130,13 +130,17 @@ class Env:
     def step(self, action: Tensor) -> StepResult:
         """One control step of (N, A, act) actions in [-1, 1] (clipped here).
 
-        Raises ValueError for an action of another shape.
+        Raises ValueError for an action of another shape and, on a CPU, for one that is not finite.
+        On a GPU, which is not waited for, the worlds of such an action diverge (``valid``).
         """
         if action.shape != (self.num_worlds, self.num_agents, self.action_size):
             raise ValueError(
                 f"action has shape {tuple(action.shape)}, expected "
                 f"{(self.num_worlds, self.num_agents, self.action_size)}"
             )
+        if self.device.type == "cpu" and not action.isfinite().all():
+            worlds = (~action.isfinite()).flatten(1).any(1).nonzero()[:, 0].tolist()
+            raise ValueError(f"the action is not finite in {len(worlds)} worlds: {worlds[:8]}")
         with no_autograd() if self._stocks else contextlib.nullcontext():
             return self._step(action)
 
@@ -367,8 +371,8 @@ def make_env(
     """An environment of ``num_worlds`` worlds of a task on an engine.
 
     ``options`` are the fields of the task's config, ``physics_options`` those of the engine.
-    Raises ValueError for an unknown task, option, strength or engine, RuntimeError when the
-    engine cannot run here.
+    Raises ValueError for an unknown task, option, strength or engine or a number of worlds below
+    1, RuntimeError when the engine cannot run here.
     """
     record = get_task(task)
     config = make_config(record, options)
