@@ -86,7 +86,7 @@ class Env:
         self.action_scale = torch.tensor(
             body.action_scale(), dtype=torch.float32, device=self.device
         )
-        foot = [link.name.endswith(("Ankle", "Toe")) for link in body.links]
+        foot = [name.endswith(("Ankle", "Toe")) or name in task.tools for name in body.link_names]
         n = self.num_worlds
         self.age = torch.zeros(n, dtype=torch.long, device=self.device)
         """Steps counted towards truncation."""
