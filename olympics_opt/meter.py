@@ -93,7 +93,7 @@ class Meter:
         shape = (16, env.num_worlds, env.num_agents, env.action_size)
         noise = torch.randn(shape, generator=generator, device=env.device)
         self._actions = SIGMA * noise
-        self._controls = (self._actions.clamp(-1, 1) * env.action_scale).flatten(2)
+        self._controls = env.targets(self._actions).flatten(2)
         self._bare = _bare(env)
         self.agent: PPO | None = None
         self._obs = env.reset()

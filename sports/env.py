@@ -86,7 +86,12 @@ class Env:
         self.action_scale = torch.tensor(
             body.action_scale(), dtype=torch.float32, device=self.device
         )
-        foot = [link.name.endswith(("Ankle", "Toe")) for link in body.links]
+        """(act,) rad per unit action."""
+        self.action_offset = torch.tensor(
+            scene.action_offset(), dtype=torch.float32, device=self.device
+        )
+        """(act,) PD targets of action 0 (rad)."""
+        foot = [name.endswith(("Ankle", "Toe")) or name in task.tools for name in body.link_names]
         n = self.num_worlds
         self.age = torch.zeros(n, dtype=torch.long, device=self.device)
         """Steps counted towards truncation."""
@@ -144,9 +149,13 @@ class Env:
         with no_autograd() if self._stocks else contextlib.nullcontext():
             return self._step(action)
 
+    def targets(self, action: Tensor) -> Tensor:
+        """(..., act) PD targets (rad) of actions (..., act), which are clipped to [-1, 1]."""
+        limited = action.to(torch.float32).clamp(-1.0, 1.0)
+        return torch.addcmul(self.action_offset, limited, self.action_scale)
+
     def _step(self, action: Tensor) -> StepResult:
-        ctrl = action.to(torch.float32).clamp(-1.0, 1.0) * self.action_scale
-        self.physics.step(ctrl.flatten(1))
+        self.physics.step(self.targets(action).flatten(1))
         self.view.clock = self.view.clock + 1
         self.age = self.age + 1
         self.view.refresh()

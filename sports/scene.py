@@ -76,6 +76,9 @@ class Scene:
     """Constraint rows reserved per world on the GPU; 0 for the default of the body."""
     contacts_per_world: int = 0
     """Contacts reserved per world on the GPU; 0 for the default of the body."""
+    offset: Mapping[str, float] = field(default_factory=dict)
+    """PD targets (rad) of action 0 by dof, of every athlete; 0 for the others. An athlete who
+    holds something goes on holding it with action 0."""
     sites: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Named marks drawn by the renderer (goal, line), world frame (m)."""
 
@@ -108,6 +111,10 @@ class Scene:
     def nu(self) -> int:
         """Actuators of all agents together."""
         return self.num_agents * self.body.num_dofs
+
+    def action_offset(self) -> np.ndarray:
+        """(num_dofs,) PD targets (rad) of action 0, of one athlete."""
+        return np.array([self.offset.get(dof.name, 0.0) for dof in self.body.dofs])
 
     def agent_qpos(self, agent: int) -> slice:
         """Where an agent's 7 + num_dofs positions lie in ``qpos``."""

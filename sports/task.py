@@ -36,7 +36,7 @@ class View:
     """(N,) control steps since the reset; 1 after the first step."""
     control_timestep: float
     lowest: Tensor
-    """(B,) heights (m) below which a link's origin means a fall; -inf for ankles and toes."""
+    """(B,) heights (m) below which a link's origin means a fall; -inf for ankles, toes, tools."""
     heaviest: Tensor
     """(B,) squared forces of the ground (N^2) above which a link has fallen; inf for those."""
     _heading: Heading | None = None
@@ -80,8 +80,8 @@ class View:
         return self.pressure > 0
 
     def fallen(self) -> Tensor:
-        """(N, A) sports.md, Common: a link other than ankles and toes below 0.15 m (head 0.30 m)
-        or pressed on the ground with more than 50 N; from the second control step on."""
+        """(N, A) sports.md, Common: a link other than ankles, toes and the tool below 0.15 m (head
+        0.30 m) or pressed on the ground with more than 50 N; from the second control step on."""
         low = self.physics.body_pos[..., 2] < self.lowest
         return (low | (self.pressure > self.heaviest)).any(-1) & (self.clock >= 2)[:, None]
 
@@ -160,6 +160,9 @@ class Task:
     reward_scale: float = 1.0
     body: str = "smpl"
     equipment: tuple[str, ...] = ()
+    tools: tuple[str, ...] = ()
+    """Links that hold the equipment: they may be low and touch the ground like feet
+    (``View.fallen``)."""
     curriculum: Callable[[Any, int, torch.device], Memory] | None = None
     """(config, num_worlds, device) -> curriculum state, (N,) tensors."""
     promote: Callable[[View, Memory, Advance, Tensor], Memory] | None = None

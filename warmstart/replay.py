@@ -106,11 +106,12 @@ def play(
         timestep_divisor=timestep_divisor,
     )
     env.keep_snapshot = True
+    offset = env.physics.scene.action_offset()
     q, v = env.physics.scene.agent_qpos(0), env.physics.scene.agent_qvel(0)
     qpos, qvel, ctrl, metrics = [clip.qpos[0]], [clip.qvel[0]], [], {}
     for step in range(env.max_steps):
         target = clip.ctrl[min(step, len(clip.ctrl) - 1)]
-        action = torch.tensor(target / body.action_scale(), dtype=torch.float32)
+        action = torch.tensor((target - offset) / body.action_scale(), dtype=torch.float32)
         result = env.step(action[None, None])
         ctrl.append(target)
         metrics = {k: float(m[0]) for k, m in result.metrics.items()}
