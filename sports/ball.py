@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sports import ball_law
-from sports.ball_compiled import for_cpu, for_gpu
+from sports.ball_law import flight
+from sports.ball_law.compiled import for_cpu, for_gpu
 
 AIR_DENSITY = 1.204
 """kg/m^3, dry air at 20 deg C and 101.325 kPa (ISO 2533)."""
@@ -54,14 +54,14 @@ class BallLaw:
     """The same on waves, where it also holds a ball that has come to rest."""
 
     def numbers(self) -> np.ndarray:
-        """(BALL_NUMBERS,) as ``ball_law`` reads them."""
-        numbers = np.zeros(ball_law.BALL_NUMBERS)
-        numbers[ball_law.MASS], numbers[ball_law.RADIUS] = self.mass, self.radius
-        numbers[ball_law.SHELL] = self.shell
-        numbers[ball_law.AIR] = 0.5 * AIR_DENSITY * math.pi * self.radius**2 / self.mass
-        numbers[ball_law.DRAG_SLOW], numbers[ball_law.DRAG_FAST] = self.drag
-        numbers[ball_law.SPEED_SLOW] = self.drag_speeds[0]
-        numbers[ball_law.SPEED_SPAN] = self.drag_speeds[1] - self.drag_speeds[0]
+        """(BALL_NUMBERS,) as ``sports.ball_law`` reads them."""
+        numbers = np.zeros(flight.BALL_NUMBERS)
+        numbers[flight.MASS], numbers[flight.RADIUS] = self.mass, self.radius
+        numbers[flight.SHELL] = self.shell
+        numbers[flight.AIR] = 0.5 * AIR_DENSITY * math.pi * self.radius**2 / self.mass
+        numbers[flight.DRAG_SLOW], numbers[flight.DRAG_FAST] = self.drag
+        numbers[flight.SPEED_SLOW] = self.drag_speeds[0]
+        numbers[flight.SPEED_SPAN] = self.drag_speeds[1] - self.drag_speeds[0]
         return numbers
 
 
