@@ -161,6 +161,11 @@ class Scene:
         """The ball of the ball law, if there is one."""
         return next((o for o in self.objects if o.motion == "ball"), None)
 
+    @property
+    def has_waves(self) -> bool:
+        """Whether a surface has phases of each world."""
+        return any(s.kind == "waves" for s in self.surfaces)
+
     def surface_index(self, name: str) -> int:
         """Column of a surface in ``Physics.ball_hits``. Raises KeyError."""
         names = [s.name for s in self.surfaces]

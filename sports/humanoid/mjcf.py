@@ -108,7 +108,7 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
     node = spec.worldbody.add_body(
         name=obj.name, pos=obj.pos, quat=obj.quat, mocap=obj.motion == "mocap"
     )
-    if obj.motion == "free":
+    if obj.motion in ("free", "ball"):
         node.add_freejoint(name=obj.name)
     for shape in obj.shapes:
         fields: dict[str, object] = {
@@ -118,6 +118,8 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
             "condim": 3,
             "rgba": obj.rgba,
         }
+        if obj.motion == "ball":
+            fields |= {"contype": 0, "conaffinity": 0}
         if obj.solref is not None:
             fields["solref"] = obj.solref
         _add_shape(node, shape, **fields)
