@@ -6,7 +6,6 @@ import math
 from typing import Any, NamedTuple
 
 from sports.ball_law.flight import (
-    RADIUS,
     TINY,
     Cube,
     Matrix,
@@ -33,11 +32,11 @@ from sports.ball_law.flight import (
 IntMatrix = Any
 """Array of integers with 2 axes."""
 
-# Places in a surface's row of numbers, and of its integers.
+# Places in a surface's row of numbers, and its kinds.
 CENTER, AXES, SIZE, RESTITUTION, FRICTION, ROLLING, REACH, BEND = 0, 3, 12, 16, 17, 18, 19, 20
-SURFACE_NUMBERS = 21
-KIND, TOOL = 0, 1
-PLANE, BOX, DISC, WAVES = 0, 1, 2, 3
+KIND, TOOL, BALL_RADIUS = 21, 22, 23
+SURFACE_NUMBERS = 24
+PLANE, BOX, DISC, WAVES = 0.0, 1.0, 2.0, 3.0
 
 # Places in a tool's row of numbers.
 TOOL_MASS, TOOL_CENTER, TOOL_COMPLIANCE = 0, 1, 4
@@ -63,12 +62,11 @@ class Game(NamedTuple):
 
     ball: Row
     """(BALL_NUMBERS,)"""
-    kinds: IntMatrix
-    """(S, 2) kind, and the tool that it is on or -1."""
     surfaces: Matrix
     """(S, SURFACE_NUMBERS) centre and axes (of the surface's frame, by columns) in the tool's or
     the world's frame, size, restitution, friction, deceleration of a rolling ball, greatest
-    distance from the tool's origin, bound of the curvature (1/m)."""
+    distance from the tool's origin, bound of the curvature (1/m), kind, the tool that it is on or
+    -1, radius of the ball."""
     tools: Matrix
     """(T, TOOL_NUMBERS) mass, centre of mass, and inverse inertia about it (xx, yy, zz, xy, xz,
     yz) in the link's frame."""
@@ -185,11 +183,11 @@ def wave(
     return rise * swell, slope_x, slope_y
 
 
-def gap(game: Game, w: int, i: int, x: Vector) -> tuple[float, Vector]:
+def gap(surfaces: Matrix, i: int, x: Vector, a: float, b: float) -> tuple[float, Vector]:
     """Between a ball at ``x`` in the frame of surface ``i`` and that surface (m; over waves
-    along z), and its gradient, longer than 1 only over waves."""
-    kind, radius = game.kinds[i, KIND], game.ball[RADIUS]
-    size = row(game.surfaces, i, SIZE)
+    along z), and its gradient, longer than 1 only over waves. Waves have the phases a, b."""
+    kind, radius = surfaces[i, KIND], surfaces[i, BALL_RADIUS]
+    size = row(surfaces, i, SIZE)
     if kind == BOX:
         far, away = from_box(x, size)
         return far - radius, away
@@ -197,17 +195,16 @@ def gap(game: Game, w: int, i: int, x: Vector) -> tuple[float, Vector]:
         far, away = from_disc(x, size[0], size[1])
         return far - radius, away
     if kind == WAVES:
-        outer, a, b = game.surfaces[i, SIZE + 3], game.phases[w, 0], game.phases[w, 1]
-        h, sx, sy = wave(x[0], x[1], size[0], size[1], size[2], outer, a, b)
+        h, sx, sy = wave(x[0], x[1], size[0], size[1], size[2], surfaces[i, SIZE + 3], a, b)
         return x[2] - h - radius * math.sqrt(1.0 + sx * sx + sy * sy), vec(-sx, -sy, 1.0)
     return x[2] - radius, vec(0.0, 0.0, 1.0)
 
 
-def window(game: Game, w: int, t: int) -> tuple[Vector, Quat, Vector, float, Vector]:
+def window(before: Cube, after: Cube, w: int, t: int) -> tuple[Vector, Quat, Vector, float, Vector]:
     """The motion of a tool in a substep: origin and attitude at its beginning; the unit axis and
     the angle of its turn, and the move of its origin, until the end."""
-    origin, end = cell(game.before, w, t, 0), cell(game.after, w, t, 0)
-    old, new = posture(game.before, w, t), posture(game.after, w, t)
+    origin, end = cell(before, w, t, 0), cell(after, w, t, 0)
+    old, new = posture(before, w, t), posture(after, w, t)
     d = product(new, quat(old[0], -old[1], -old[2], -old[3]))
     s = sign(d[0])
     half = math.sqrt(d[1] * d[1] + d[2] * d[2] + d[3] * d[3])
@@ -233,9 +230,13 @@ def carried(
 
 
 def search(
-    game: Game,
+    surfaces: Matrix,
+    before: Cube,
+    after: Cube,
     w: int,
     i: int,
+    a: float,
+    b: float,
     begin: float,
     share: float,
     slack: float,
@@ -252,24 +253,24 @@ def search(
     The path covers ``share`` of the substep from ``begin`` on. A touching ball that leaves slower
     than ``slack`` (m by s) is in contact.
     """
-    tool = game.kinds[i, TOOL]
-    center = row(game.surfaces, i, CENTER)
-    ax, ay = row(game.surfaces, i, AXES), row(game.surfaces, i, AXES + 3)
-    az = row(game.surfaces, i, AXES + 6)
+    tool = int(surfaces[i, TOOL])
+    center = row(surfaces, i, CENTER)
+    ax, ay = row(surfaces, i, AXES), row(surfaces, i, AXES + 3)
+    az = row(surfaces, i, AXES + 6)
     lb, lc, ld = length(cb), length(cc), length(cd)
     path, fast = lb + lc + ld, lb + 2.0 * lc + 3.0 * ld
     bend = 2.0 * lc + 6.0 * ld + TINY
     origin, axis, move = vec(0.0, 0.0, 0.0), vec(0.0, 0.0, 1.0), vec(0.0, 0.0, 0.0)
     angle = float(0.0)
     if tool >= 0:
-        near = game.surfaces[i, REACH] + game.ball[RADIUS] + path + TOUCH
-        far = length(ahead(ca, -1.0, cell(game.before, w, tool, 0)))
-        drift = cell(game.after, w, tool, 0)
-        drift = ahead(drift, -1.0, cell(game.before, w, tool, 0))
+        near = surfaces[i, REACH] + surfaces[i, BALL_RADIUS] + path + TOUCH
+        far = length(ahead(ca, -1.0, cell(before, w, tool, 0)))
+        drift = cell(after, w, tool, 0)
+        drift = ahead(drift, -1.0, cell(before, w, tool, 0))
         shift = WIDER * length(drift)
         if far > near + shift:
             return FAR, 0
-        origin, old, axis, angle, move = window(game, w, tool)
+        origin, old, axis, angle, move = window(before, after, w, tool)
         lx, ly, lz = axis_x(old), axis_y(old), axis_z(old)
         center = combine(lx, ly, lz, center)
         ax, ay = combine(lx, ly, lz, ax), combine(lx, ly, lz, ay)
@@ -279,8 +280,8 @@ def search(
         meet = fast + quick
         bend = bend + whirl * (quick + 2.0 * meet + whirl * (far + shift + meet))
     else:
-        g, slope = gap(game, w, i, project(ax, ay, az, ahead(ca, -1.0, center)))
-        curve = game.surfaces[i, BEND]
+        g, slope = gap(surfaces, i, project(ax, ay, az, ahead(ca, -1.0, center)), a, b)
+        curve = surfaces[i, BEND]
         if g > (length(slope) + curve * path) * path + TOUCH:
             return FAR, 0
         bend = bend + curve * fast * fast
@@ -295,7 +296,7 @@ def search(
             dp = ahead(dp, -share, ahead(do, angle, cross(axis, p)))
             if angle >= STILL:
                 p, dp = turned(axis, -angle * at, p), turned(axis, -angle * at, dp)
-        g, slope = gap(game, w, i, project(ax, ay, az, ahead(p, -1.0, center)))
+        g, slope = gap(surfaces, i, project(ax, ay, az, ahead(p, -1.0, center)), a, b)
         rate = dot(slope, project(ax, ay, az, dp))
         if g <= TOUCH and rate < slack:
             return s, 1
@@ -308,24 +309,32 @@ def search(
 
 
 def meeting(
-    game: Game, w: int, i: int, at: float, p: Vector
+    surfaces: Matrix,
+    before: Cube,
+    after: Cube,
+    w: int,
+    i: int,
+    a: float,
+    b: float,
+    at: float,
+    p: Vector,
 ) -> tuple[float, Vector, Vector, Vector]:
     """A ball at ``p`` and surface ``i`` after a share of the substep: the gap (m), the unit normal
     towards the ball, the origin of the surface's link (or of the world) and the velocity, by
     substep, of its point at the contact."""
-    tool = game.kinds[i, TOOL]
-    center = row(game.surfaces, i, CENTER)
-    ax, ay = row(game.surfaces, i, AXES), row(game.surfaces, i, AXES + 3)
-    az = row(game.surfaces, i, AXES + 6)
+    tool = int(surfaces[i, TOOL])
+    center = row(surfaces, i, CENTER)
+    ax, ay = row(surfaces, i, AXES), row(surfaces, i, AXES + 3)
+    az = row(surfaces, i, AXES + 6)
     if tool < 0:
-        g, slope = gap(game, w, i, project(ax, ay, az, ahead(p, -1.0, center)))
+        g, slope = gap(surfaces, i, project(ax, ay, az, ahead(p, -1.0, center)), a, b)
         scale, zero = 1.0 / length(slope), vec(0.0, 0.0, 0.0)
         return scale * g, times(scale, combine(ax, ay, az, slope)), zero, zero
-    origin, old, axis, angle, move = window(game, w, tool)
+    origin, old, axis, angle, move = window(before, after, w, tool)
     o, do = carried(origin, axis, angle, move, at)
     lx, ly, lz = axis_x(old), axis_y(old), axis_z(old)
     q = project(lx, ly, lz, turned(axis, -angle * at, ahead(p, -1.0, o)))
-    g, slope = gap(game, w, i, project(ax, ay, az, ahead(q, -1.0, center)))
+    g, slope = gap(surfaces, i, project(ax, ay, az, ahead(q, -1.0, center)), a, b)
     n = turned(axis, angle * at, combine(lx, ly, lz, combine(ax, ay, az, slope)))
-    arm = ahead(ahead(p, -game.ball[RADIUS], n), -1.0, o)
+    arm = ahead(ahead(p, -surfaces[i, BALL_RADIUS], n), -1.0, o)
     return g, n, o, ahead(do, angle, cross(axis, arm))

@@ -77,23 +77,30 @@ NO_HIT = math.inf
 """The time of an impact that was not."""
 
 
-def tool_matrix(game: Game, t: int, arm: Vector) -> tuple[Vector, Vector]:
+def tool_matrix(tools: Matrix, t: int, arm: Vector) -> tuple[Vector, Vector]:
     """What a tool, as a free rigid body, adds to the M of ``impulse``; ``arm`` from its origin to
     the contact, all in its frame."""
-    c = ahead(arm, -1.0, row(game.tools, t, TOOL_CENTER))
-    pure = row(game.tools, t, TOOL_COMPLIANCE)
-    mixed = row(game.tools, t, TOOL_COMPLIANCE + 3)
+    c = ahead(arm, -1.0, row(tools, t, TOOL_CENTER))
+    pure = row(tools, t, TOOL_COMPLIANCE)
+    mixed = row(tools, t, TOOL_COMPLIANCE + 3)
     x = cross(symmetric(pure, mixed, vec(0.0, c[2], -c[1])), c)
     y = cross(symmetric(pure, mixed, vec(-c[2], 0.0, c[0])), c)
     z = cross(symmetric(pure, mixed, vec(c[1], -c[0], 0.0)), c)
-    free = 1.0 / game.tools[t, TOOL_MASS]
+    free = 1.0 / tools[t, TOOL_MASS]
     return vec(free + x[0], free + y[1], free + z[2]), vec(y[0], z[0], z[1])
 
 
 def hit(
-    game: Game,
+    ball: Row,
+    surfaces: Matrix,
+    tools: Matrix,
+    before: Cube,
+    after: Cube,
+    pending: Cube,
     w: int,
     i: int,
+    a: float,
+    b: float,
     at: float,
     dt: float,
     p: Vector,
@@ -102,10 +109,10 @@ def hit(
     bouncing: int,
 ) -> tuple[Vector, Vector, Vector, int]:
     """An impact of a ball on surface ``i``: its position (moved out of the surface), velocity and
-    spin; 1 where it bounced, 0 where the surface holds it from now on. Adds to ``game.pending``
+    spin; 1 where it bounced, 0 where the surface holds it from now on. Adds to ``pending``
     what a tool feels. ``bouncing`` 0: do not bounce, whatever the speed."""
-    tool, radius = game.kinds[i, TOOL], game.ball[RADIUS]
-    g, n, o, flow = meeting(game, w, i, at, p)
+    tool, radius = int(surfaces[i, TOOL]), ball[RADIUS]
+    g, n, o, flow = meeting(surfaces, before, after, w, i, a, b, at, p)
     if g > 2.0 * TOUCH:
         return p, v, spin, 1
     q = ahead(p, -min(g, 0.0), n)
@@ -117,59 +124,81 @@ def hit(
     restitution = float(0.0)
     if bouncing == 1 and speed >= SOFT:
         bounced = 1
-        restitution = float(game.surfaces[i, RESTITUTION])
-    friction = game.surfaces[i, FRICTION]
+        restitution = float(surfaces[i, RESTITUTION])
+    friction = surfaces[i, FRICTION]
     push = vec(0.0, 0.0, 0.0)
     if tool < 0:
-        diagonal, mixed = ball_matrix(n, game.ball)
+        diagonal, mixed = ball_matrix(n, ball)
         push = impulse(slip, n, diagonal, mixed, restitution, friction)
     else:
         # In the tool's frame, where its inertia is known.
-        origin, old, axis, angle, move = window(game, w, tool)
+        origin, old, axis, angle, move = window(before, after, w, tool)
         lx = turned(axis, angle * at, axis_x(old))
         ly = turned(axis, angle * at, axis_y(old))
         lz = turned(axis, angle * at, axis_z(old))
         contact = ahead(p, -radius, n)
         own = project(lx, ly, lz, n)
-        diagonal, mixed = ball_matrix(own, game.ball)
-        more, mingled = tool_matrix(game, tool, project(lx, ly, lz, ahead(contact, -1.0, o)))
+        diagonal, mixed = ball_matrix(own, ball)
+        more, mingled = tool_matrix(tools, tool, project(lx, ly, lz, ahead(contact, -1.0, o)))
         diagonal, mixed = add(diagonal, more), add(mixed, mingled)
         push = impulse(project(lx, ly, lz, slip), own, diagonal, mixed, restitution, friction)
         push = combine(lx, ly, lz, push)
         moment = cross(contact, push)
         for k in range(3):
-            game.pending[w, tool, k] = game.pending[w, tool, k] - push[k]
-            game.pending[w, tool, 3 + k] = game.pending[w, tool, 3 + k] - moment[k]
-    u, whirl = struck(v, spin, n, push, game.ball)
+            pending[w, tool, k] = pending[w, tool, k] - push[k]
+            pending[w, tool, 3 + k] = pending[w, tool, 3 + k] - moment[k]
+    u, whirl = struck(v, spin, n, push, ball)
     return q, u, whirl, bounced
 
 
 def rolled(
-    game: Game, w: int, i: int, h: float, p: Vector, v: Vector, spin: Vector
+    ball: Row,
+    surfaces: Matrix,
+    before: Cube,
+    after: Cube,
+    w: int,
+    i: int,
+    a: float,
+    b: float,
+    h: float,
+    p: Vector,
+    v: Vector,
+    spin: Vector,
 ) -> tuple[Vector, Vector]:
     """Velocity and spin of a ball that lay on surface ``i`` for a time: slowed where it rolls."""
-    if game.kinds[i, TOOL] >= 0:
+    if surfaces[i, TOOL] >= 0.0:
         return v, spin
-    g, n, o, flow = meeting(game, w, i, 1.0, p)
-    slip = ahead(v, -game.ball[RADIUS], cross(spin, n))
+    g, n, o, flow = meeting(surfaces, before, after, w, i, a, b, 1.0, p)
+    slip = ahead(v, -ball[RADIUS], cross(spin, n))
     slip = ahead(slip, -dot(slip, n), n)
     if g > TOUCH or n[2] < UPRIGHT or dot(slip, slip) > ROLLS * ROLLS:
         return v, spin
-    speed, loss = length(v), h * game.surfaces[i, ROLLING]
+    speed, loss = length(v), h * surfaces[i, ROLLING]
     if speed <= loss:
         return vec(0.0, 0.0, 0.0), vec(0.0, 0.0, 0.0)
     return times(1.0 - loss / speed, v), times(1.0 - loss / speed, spin)
 
 
-def lies(game: Game, w: int, p: Vector, v: Vector, spin: Vector) -> int:
+def lies(
+    ball: Row,
+    surfaces: Matrix,
+    before: Cube,
+    after: Cube,
+    w: int,
+    a: float,
+    b: float,
+    p: Vector,
+    v: Vector,
+    spin: Vector,
+) -> int:
     """1 where a ball is at rest, held by a surface against the pull along its slope."""
     if dot(v, v) > 0.0 or dot(spin, spin) > 0.0:
         return 0
-    for i in range(game.kinds.shape[0]):
-        if game.kinds[i, TOOL] < 0:
-            g, n, o, flow = meeting(game, w, i, 0.0, p)
-            pull = GRAVITY / (1.0 + game.ball[SHELL]) * math.sqrt(max(1.0 - n[2] * n[2], 0.0))
-            if abs(g) <= TOUCH and n[2] >= UPRIGHT and pull <= game.surfaces[i, ROLLING]:
+    for i in range(surfaces.shape[0]):
+        if surfaces[i, TOOL] < 0.0:
+            g, n, o, flow = meeting(surfaces, before, after, w, i, a, b, 0.0, p)
+            pull = GRAVITY / (1.0 + ball[SHELL]) * math.sqrt(max(1.0 - n[2] * n[2], 0.0))
+            if abs(g) <= TOUCH and n[2] >= UPRIGHT and pull <= surfaces[i, ROLLING]:
                 return 1
     return 0
 
@@ -188,9 +217,12 @@ def play(game: Game, w: int, dt: float) -> None:
     ``game.after``. ``dt`` 0: nothing happens."""
     if not dt > 0.0:
         return
+    ball, surfaces, tools, pending = game.ball, game.surfaces, game.tools, game.pending
+    before, after = game.before, game.after
+    a, b = float(game.phases[w, 0]), float(game.phases[w, 1])
     p, v = row(game.state, w, POS), row(game.state, w, LINVEL)
     spin = row(game.state, w, ANGVEL)
-    rests = int(lies(game, w, p, v, spin))
+    rests = int(lies(ball, surfaces, before, after, w, a, b, p, v, spin))
     still = vec(0.0, 0.0, 0.0)
     left, held = float(dt), int(0)
     for _ in range(IMPACTS):
@@ -200,35 +232,70 @@ def play(game: Game, w: int, dt: float) -> None:
         q, u = add(p, still), add(v, still)
         cb, cc, cd = add(still, still), add(still, still), add(still, still)
         if rests == 0:
-            q, u = fly(p, v, spin, left, game.ball)
+            q, u = fly(p, v, spin, left, ball)
             way = ahead(q, -1.0, p)
             cb = times(left, v)
             cc = ahead(ahead(times(3.0, way), -2.0, cb), -left, u)
             cd = ahead(ahead(cb, -2.0, way), left, u)
         first, which = float(1.0), int(-1)
-        for i in range(game.kinds.shape[0]):
-            if (held >> i) & 1 == 0 and (rests == 0 or game.kinds[i, TOOL] >= 0):
-                s, found = search(game, w, i, begin, share, SLACK * left, first, p, cb, cc, cd)
+        for i in range(surfaces.shape[0]):
+            if (held >> i) & 1 == 0 and (rests == 0 or surfaces[i, TOOL] >= 0.0):
+                s, found = search(
+                    surfaces,
+                    before,
+                    after,
+                    w,
+                    i,
+                    a,
+                    b,
+                    begin,
+                    share,
+                    SLACK * left,
+                    first,
+                    p,
+                    cb,
+                    cc,
+                    cd,
+                )
                 if s < first:
                     first = s
                     which = i if found == 1 else -2
         part = first * left
         if which != -1 and rests == 0:
-            q, u = fly(p, v, spin, part, game.ball)
+            q, u = fly(p, v, spin, part, ball)
         p, v = q, u
         left = left - part
         if which == -1:
             left = 0.0
         at = 1.0 - left / dt
         if held != 0:
-            for i in range(game.kinds.shape[0]):
+            for i in range(surfaces.shape[0]):
                 if (held >> i) & 1 == 1:
-                    p, v, spin, bounced = hit(game, w, i, at, dt, p, v, spin, 0)
-                    v, spin = rolled(game, w, i, part, p, v, spin)
+                    p, v, spin, bounced = hit(
+                        ball,
+                        surfaces,
+                        tools,
+                        before,
+                        after,
+                        pending,
+                        w,
+                        i,
+                        a,
+                        b,
+                        at,
+                        dt,
+                        p,
+                        v,
+                        spin,
+                        0,
+                    )
+                    v, spin = rolled(ball, surfaces, before, after, w, i, a, b, part, p, v, spin)
         if which >= 0:
             rests = 0
             note(game, w, which, game.clock[w] + dt - left, p)
-            p, v, spin, bounced = hit(game, w, which, at, dt, p, v, spin, 1)
+            p, v, spin, bounced = hit(
+                ball, surfaces, tools, before, after, pending, w, which, a, b, at, dt, p, v, spin, 1
+            )
             if bounced == 1:
                 held = 0
             else:
@@ -236,10 +303,27 @@ def play(game: Game, w: int, dt: float) -> None:
     if left > LITTLE * dt:
         # Squeezed: out of the tools, then out of what does not move.
         for fixed in range(2):
-            for i in range(game.kinds.shape[0]):
-                moves = 1 if game.kinds[i, TOOL] >= 0 else 0
+            for i in range(surfaces.shape[0]):
+                moves = 1 if surfaces[i, TOOL] >= 0.0 else 0
                 if moves + fixed == 1:
-                    p, v, spin, bounced = hit(game, w, i, 1.0, dt, p, v, spin, 0)
+                    p, v, spin, bounced = hit(
+                        ball,
+                        surfaces,
+                        tools,
+                        before,
+                        after,
+                        pending,
+                        w,
+                        i,
+                        a,
+                        b,
+                        1.0,
+                        dt,
+                        p,
+                        v,
+                        spin,
+                        0,
+                    )
     for k in range(3):
         game.state[w, POS + k] = p[k]
         game.state[w, LINVEL + k] = v[k]

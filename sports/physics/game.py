@@ -13,17 +13,20 @@ import numpy as np
 from sports.ball import BallLaw, ball_of
 from sports.ball_law.contact import (
     AXES,
+    BALL_RADIUS,
     BEND,
     BOX,
     CENTER,
     DISC,
     FRICTION,
+    KIND,
     PLANE,
     REACH,
     RESTITUTION,
     ROLLING,
     SIZE,
     SURFACE_NUMBERS,
+    TOOL,
     TOOL_CENTER,
     TOOL_COMPLIANCE,
     TOOL_MASS,
@@ -73,11 +76,11 @@ def build_game(
     chains, offsets = _chains(scene, links, agents)
     places = [] if ball is None else [_place(scene, ball.name)]
     rows = np.array([_numbers(s, law) for s in scene.surfaces]).reshape(-1, SURFACE_NUMBERS)
-    kinds = [(_KINDS[s.kind], links.index(s.link) if s.link else -1) for s in scene.surfaces]
+    for k, surface in enumerate(scene.surfaces):
+        rows[k, TOOL] = links.index(surface.link) if surface.link else -1
     found = [(number, *_place(scene, o.name)) for number, o in zip(numbers[tools:], dragged)]
     return Game(
         ball=law.numbers(),
-        kinds=_integers(kinds, 2),
         surfaces=rows,
         tools=np.array([_tool(model, link) for link in links]).reshape(-1, TOOL_NUMBERS),
         phases=np.zeros((n, 2)),
@@ -114,6 +117,7 @@ def _numbers(surface: Surface, law: BallLaw) -> np.ndarray:
     own, tool = np.zeros(SURFACE_NUMBERS), surface.link is not None
     axes = np.empty(9)
     mujoco.mju_quat2Mat(axes, np.array(surface.quat) / np.linalg.norm(surface.quat))
+    own[KIND], own[BALL_RADIUS] = _KINDS[surface.kind], law.radius
     own[CENTER : CENTER + 3] = surface.center
     own[AXES : AXES + 9] = axes.reshape(3, 3).T.ravel()
     own[SIZE : SIZE + len(surface.size)] = surface.size
