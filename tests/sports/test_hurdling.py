@@ -1,6 +1,7 @@
 """Hurdling: rules on states made by hand, closed forms, and what three engines make of it."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -17,7 +18,7 @@ HURDLE_X = [13.72 + 9.14 * k for k in range(10)]
 TOE = 0.0914 + 0.3752 + 0.3980 + 0.0558  # the left toe's joint below the root, from the body table
 
 
-def at(x: float, y: float = 0.0, z: float = STANDING, **options: object) -> HandMade:
+def at(x: float, y: float = 0.0, z: float = STANDING, **options: Any) -> HandMade:
     world = HandMade("hurdling", **options)
     world.place((x, y, z))
     world.begin()
@@ -236,6 +237,7 @@ def test_a_finish_over_a_high_hurdle_raises_the_next_ones():
     env.memory["highest"] = torch.tensor([0.41, 0.39, 0.5, 0.5, 1.0, 1.0])
     env.memory["standing"] = torch.tensor([True, True, False, True, True, True])
     everyone = torch.ones(6, dtype=torch.bool)
+    assert env.task.promote is not None
     raised = env.task.promote(env.view, env.memory, step, everyone)["h_max"]
     # Proven; too low; a demonstration; no finish; up to the most; there already.
     expected = torch.tensor([0.6, 0.5, 0.5, 0.5, MOST_MAX, MOST_MAX])
@@ -257,7 +259,7 @@ def test_the_highest_hurdle_is_one_that_was_passed():
     assert seen == [(pytest.approx(h), n) for h, n in expected]
 
 
-def thrown(speeds: list[float], z: float, **options: object):
+def thrown(speeds: list[float], z: float, **options: Any):
     """Athletes thrown at the first hurdle in the T-pose, one for each speed (m/s)."""
     n = len(speeds)
     options = {"height": 1.067, **options}
