@@ -13,6 +13,8 @@ Beyond the paper's text:
   beside it or through it, and the race is over; the technical rules disqualify for the former. At
   1/120 s MuJoCo lets legs through a board 0.05 m thick from 13 m/s on (measured). Arms may pass.
 * Touching a hurdle is allowed, and so are a hand or a foot on it.
+* Success is decided at the finish. A fall beyond it ends the count of the distance and takes
+  nothing back; ``upright`` is the share that finished and stood to the end.
 
 In training the athlete may start at any hurdle k: the whole start moves by k times the distance
 between hurdles, so that the run-up is that of the race, and the hurdles before k are down. Nothing
@@ -43,8 +45,8 @@ LANE_HALF_WIDTH = 0.8
 HALF_THICKNESS, HALF_WIDTH = 0.025, 1.0
 """Of a hurdle along x and y (m)."""
 HALF_DEPTH = 0.65
-"""Half of a solid hurdle's extent along z (m), most of it under the ground: it is lowered, never
-made smaller, and reaches the ground at every height up to ``HIGHEST``."""
+"""Half of a solid hurdle's extent along z (m): it is sunk into the ground, never made smaller, and
+reaches the ground at every height up to ``HIGHEST``."""
 LOWEST_TOPPLING, HIGHEST_TOPPLING, HIGHEST = 0.3, 1.1, 1.2
 """Heights that the options allow (m)."""
 DOWN_Z = -0.1
@@ -88,8 +90,8 @@ class Hurdling:
     """Hurdles are free bodies that fall when hit. Their height is then that of the race or
     ``height`` in training too: a hurdle that stands on the ground cannot be sunk into it."""
     finish_ends: bool = False
-    """End the episode at the finish. Nothing is paid beyond it, so that training loses no more
-    than steps; the paper's distance needs the whole 600."""
+    """End the episode at the finish. Nothing is paid beyond it: training is spared idle steps. The
+    paper's distance needs the whole 600."""
 
     def __post_init__(self) -> None:
         low, high, kind = 0.0, HIGHEST, "hurdle"
