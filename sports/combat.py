@@ -36,8 +36,8 @@ FACING, VELOCITY, STRIKE, POINT = 0.1, 0.1, 0.6, 1.0
 WANTED_SPEED = 1.0
 """Towards the opponent (m/s); more is not paid."""
 MAX_LOAD = 10.0
-"""Forces felt are shown up to this many body weights, so that their squares stay numbers that a
-network can take; a hard punch is about 5."""
+"""Body weights up to which forces are shown, so that their squares stay numbers that a network can
+take."""
 ROWS, CONTACTS = 288, 72
 """``Scene.rows_per_world`` and ``contacts_per_world``: twice the most seen in 32 worlds and 300
 steps of two athletes thrashing on top of each other (144, 35); at play it is about 100 and 25."""
