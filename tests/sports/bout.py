@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
 from sports.combat import TARGETS
-from sports.env import Env, make_env
+from sports.env import Env, StepResult, make_env
 from sports.physics import default_state
 from sports.scene import Scene
 from sports.task import Advance
@@ -82,9 +83,15 @@ class Bout:
         self.env.memory = step.memory
         return step
 
-    def reach_out(
-        self, distance: float, target: str = "Chest", length: float | None = None
-    ) -> None:
+    def play(self, steps: int) -> Iterator[StepResult]:
+        """The engine's own steps from where the bout stands; the joints stay as they are placed."""
+        env, scene = self.env, self.scene
+        joints = [self.state.qpos[:, scene.agent_qpos(a)][:, 7:] for a in range(2)]
+        action = (torch.stack(joints, dim=1) - env.action_offset) / env.action_scale
+        for _ in range(steps):
+            yield env.step(action)
+
+    def reach_out(self, distance: float, target: str = "Chest") -> None:
         """Both in T-pose, athlete 0 at the origin with its right arm along +x, and the opponent's
         target ``distance`` (m) beyond the weapon's point; summed from the body table."""
         length = 0.98 if self.env.task.name == "fencing" else 0.0
