@@ -10,8 +10,7 @@ from sports.humanoid.body import load_body
 from sports.task import Task
 
 _TASKS: dict[str, Task] = {
-    t.name: t
-    for t in (high_jump.TASK, long_jump.TASK, hurdling.TASK, fencing.TASK, boxing.TASK)
+    t.name: t for t in (high_jump.TASK, long_jump.TASK, hurdling.TASK, fencing.TASK, boxing.TASK)
 }
 
 

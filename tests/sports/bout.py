@@ -18,9 +18,13 @@ from sports.task import Advance
 class Bout:
     """An environment whose next step is decided by the test, not by an engine."""
 
-    def __init__(self, task: str, num_worlds: int = 1) -> None:
+    def __init__(self, task: str, num_worlds: int = 1, engine: str = "mujoco") -> None:
         self.env: Env = make_env(
-            task, num_worlds=num_worlds, training=False, physics_options={"threads": 1}
+            task,
+            engine=engine,
+            num_worlds=num_worlds,
+            training=False,
+            physics_options={"device": "cpu"} if engine == "warp" else {},
         )
         self.scene, self.body = self.env.physics.scene, self.env.physics.scene.body
         self.state = default_state(self.scene, num_worlds, "cpu")

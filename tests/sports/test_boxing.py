@@ -65,16 +65,6 @@ def test_the_nearer_glove_strikes():
     assert pay == pytest.approx([0.6 * math.exp(-10 * 0.04)] * 2, abs=1e-5)
 
 
-def test_a_blow_scores_in_the_engine():
-    """A glove moved on the chest at 2 m/s, one point; the opponent scores none."""
-    bout = Bout("boxing")
-    bout.reach_out(0.25)
-    bout.move(0, 2.0, 0.0, 0.0)
-    bout.begin()
-    points = [float(r.terms["point"][0, 0]) for r in bout.play(10)]
-    assert sum(points) == 1.0
-
-
 def test_a_kick_scores_nothing():
     """A horizontal leg whose foot meets the pelvis."""
     bout = Bout("boxing")

@@ -338,57 +338,19 @@ def test_half_a_turn_with_the_athletes_exchanged_changes_nothing(task):
     assert terms["point"].abs().sum() > 0 and terms["velocity"].max() > 0.01
 
 
-def test_permuting_the_worlds_permutes_every_output(task):
-    n = 6
-    order = torch.tensor([3, 0, 5, 1, 4, 2])
-    straight, permuted = (make_env(task, num_worlds=n, training=False) for _ in range(2))
-    state, everyone = scattered(straight, 7), torch.ones(n, dtype=torch.bool)
-    generator = torch.Generator().manual_seed(7)
-    for env, rows in ((straight, torch.arange(n)), (permuted, order)):
-        start = PhysicsState(state.qpos[rows], state.qvel[rows], state.mocap_pos[rows])
-        env.physics.reset(everyone, start)
-        env.view.refresh()
-        env.memory = env.task.begin(env.view, {})
-    ended = 0
-    for _ in range(12):
-        action = 0.2 * torch.randn(n, 2, 69, generator=generator)
-        a, b = straight.step(action), permuted.step(action[order])
-        ended += int(a.ended.sum())
-        for name in ("obs", "final_obs", "reward", "terminated", "truncated", "valid"):
-            assert torch.equal(getattr(a, name)[order], getattr(b, name)), name
-        for name, value in (a.terms | a.metrics).items():
-            assert torch.equal(value[order], (b.terms | b.metrics)[name]), name
-    assert ended
-
-
-def test_a_seed_decides_everything(task):
-    runs = []
-    for _ in range(2):
-        env = make_env(task, num_worlds=4, seed=3)
-        generator = torch.Generator().manual_seed(0)
-        for _ in range(25):
-            result = env.step(0.2 * torch.randn(4, 2, 69, generator=generator))
-        runs.append((env.physics.qpos.clone(), result.obs, result.reward))
-    for one, other in zip(*runs):
-        assert torch.equal(one, other)
-
-
-def test_random_play_stays_finite(task):
-    """200 steps of 32 worlds; bouts end by falls and begin anew."""
-    env = make_env(task, num_worlds=32, seed=1)
+def test_random_play_stays_within_bounds(task):
+    """What one gains the other loses; the other terms are between 0 and their weights."""
+    env = make_env(task, num_worlds=16, seed=1)
     generator = torch.Generator().manual_seed(4)
-    ended, everything = 0, 0.0
-    for _ in range(200):
-        result = env.step(0.15 * torch.randn(32, 2, 69, generator=generator))
-        assert torch.isfinite(result.obs).all() and torch.isfinite(result.reward).all()
-        for name in ("facing", "velocity", "strike"):
+    largest = 0.0
+    for _ in range(80):
+        result = env.step(0.15 * torch.randn(16, 2, 69, generator=generator))
+        for name, weight in (("facing", 0.1), ("velocity", 0.1), ("strike", 0.6)):
             term = result.terms[name]
-            assert float(term.min()) >= 0.0 and float(term.max()) <= 0.6 + 1e-6
+            assert float(term.min()) >= 0.0 and float(term.max()) <= weight + 1e-6
         assert (result.terms["point"].sum(1) == 0).all()
-        ended += int(result.ended.sum())
-        everything = max(everything, float(result.obs.abs().max()))
-    assert ended > 32 and everything < 1e3
-    assert env.physics.nan_worlds == 0 and env.physics.overflow == 0
+        largest = max(largest, float(result.obs.abs().max()))
+    assert largest < 200.0 and env.physics.nan_worlds == 0
 
 
 def test_mujoco_and_warp_stand_on_guard_together(task):
@@ -413,14 +375,15 @@ def test_mujoco_and_warp_stand_on_guard_together(task):
     assert int(w.overflow) == 0 and int(w.nan_worlds) == 0
 
 
-def test_drake_plays_the_same_bout(task):
-    """The guard held for half a second; another contact model, so within a few mm."""
-    pytest.importorskip("pydrake")
-    drake = make_env(task, engine="drake", num_worlds=1, training=False)
-    mujoco = make_env(task, num_worlds=1, training=False)
-    action = torch.zeros(1, 2, 69)
-    for _ in range(15):
-        a, b = drake.step(action), mujoco.step(action)
-    assert drake.physics.pair_force.shape == mujoco.physics.pair_force.shape
-    assert (drake.physics.body_pos - mujoco.physics.body_pos).norm(dim=-1).max() < 0.02
-    assert (a.reward - b.reward).abs().max() < 0.01
+@pytest.mark.parametrize("engine", ["mujoco", "warp", "drake"])
+def test_a_blow_scores_once(task, engine):
+    """The opponent's chest just beyond the weapon of an athlete that comes on at 1.5 m/s, on every
+    engine; then the weapon is pushed on."""
+    pytest.importorskip({"mujoco": "mujoco", "warp": "mujoco_warp", "drake": "pydrake"}[engine])
+    bout = Bout(task, engine=engine)
+    bout.reach_out(0.12 if task == "fencing" else 0.2)
+    bout.move(0, 1.5, 0.0, 0.0)
+    bout.begin()
+    results = list(bout.play(8))
+    assert sum(float(r.terms["point"][0, 0]) for r in results) == 1.0
+    assert results[-1].metrics["touches_against"][0] == 0.0
