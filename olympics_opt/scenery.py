@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sports import hurdling
 from sports.scene import Scene
 
 
@@ -57,7 +58,23 @@ def _high_jump() -> list[Mark]:
     ]
 
 
-_MARKS = {"long_jump": _long_jump, "high_jump": _high_jump}
+def _hurdling() -> list[Mark]:
+    half = hurdling.LANE_HALF_WIDTH
+    marks = [
+        _rectangle(-3.0, 130.0, -1.2, 1.2, TRACK),
+        _rectangle(-3.0, 130.0, -half - 0.05, -half, PAINT),
+        _rectangle(-3.0, 130.0, half, half + 0.05, PAINT),
+        _rectangle(-0.025, 0.025, -half, half, PAINT),
+        _rectangle(109.975, 110.025, -1.2, 1.2, PAINT, "110 m"),
+    ]
+    for k in range(hurdling.HURDLES):
+        x = hurdling.FIRST_X + hurdling.GAP * k
+        for side in (-half, half - 0.15):
+            marks.append(_rectangle(x - 0.025, x + 0.025, side, side + 0.15, PAINT))
+    return marks
+
+
+_MARKS = {"long_jump": _long_jump, "high_jump": _high_jump, "hurdling": _hurdling}
 
 
 def ground_marks(scene: Scene) -> list[Mark]:

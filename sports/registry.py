@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from sports import high_jump, long_jump
+from sports import boxing, fencing, high_jump, hurdling, long_jump
 from sports.humanoid.body import load_body
 from sports.task import Task
 
-_TASKS: dict[str, Task] = {t.name: t for t in (high_jump.TASK, long_jump.TASK)}
+_TASKS: dict[str, Task] = {
+    t.name: t for t in (high_jump.TASK, long_jump.TASK, hurdling.TASK, fencing.TASK, boxing.TASK)
+}
 
 
 def task_names() -> tuple[str, ...]:

@@ -1,0 +1,531 @@
+"""Hurdling: rules on states made by hand, closed forms, and what three engines make of it."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from sports.env import make_env, make_scene
+from sports.hurdling import MOST_MAX, least_time, toppling_shapes
+from sports.physics import PhysicsState, default_state, make_physics
+from sports.registry import get_task, make_config
+from tests.sports.hand_made import HandMade
+
+STANDING = 0.9412
+HIGH = 2.4  # root height at which the whole T-pose is above every hurdle
+HURDLE_X = [13.72 + 9.14 * k for k in range(10)]
+TOE = 0.0914 + 0.3752 + 0.3980 + 0.0558  # the left toe's joint below the root, from the body table
+
+
+def at(x: float, y: float = 0.0, z: float = STANDING, **options: Any) -> HandMade:
+    world = HandMade("hurdling", **options)
+    world.place((x, y, z))
+    world.begin()
+    return world
+
+
+def test_hurdles_and_finish_are_seen_from_the_athlete():
+    for y in (0.3, -0.3):  # and the mirrored field
+        world = at(20.0, y=y, height=0.9)
+        world._apply()
+        seen = world.env.task.features(world.env.view, world.env.memory)
+        hurdles = torch.tensor([(x - 20.0, -y, 0.9 - STANDING) for x in HURDLE_X])
+        torch.testing.assert_close(seen["hurdles"].view(10, 3), hurdles, atol=1e-4, rtol=0)
+        finish = torch.tensor([90.0, -y, 1.0 - STANDING])
+        torch.testing.assert_close(seen["finish"].view(3), finish, atol=1e-4, rtol=0)
+    # Turned to the left by 90 degrees, what was ahead is on the right.
+    world.state.qpos[:, 3:7] = torch.tensor([math.cos(math.pi / 4), 0, 0, math.sin(math.pi / 4)])
+    world._apply()
+    seen = world.env.task.features(world.env.view, world.env.memory)
+    right = torch.tensor([0.3, -90.0, 1.0 - STANDING])
+    torch.testing.assert_close(seen["finish"].view(3), right, atol=1e-3, rtol=0)
+
+
+def test_progress_is_paid_once():
+    world = at(10.0)
+    goal = (110.0, 0.0, 1.0)
+    far = [math.dist((x, 0.0, STANDING), goal) for x in (10.0, 10.3, 10.5)]
+
+    def paid(x: float) -> float:
+        world.place((x, 0.0, STANDING))
+        return float(world.advance().terms["progress"][0, 0])
+
+    assert paid(10.3) == pytest.approx(far[0] - far[1], abs=2e-5)
+    assert paid(9.8) == 0.0
+    assert paid(10.2) == 0.0  # to and fro earns nothing
+    assert paid(10.5) == pytest.approx(far[1] - far[2], abs=2e-5)
+    assert paid(13.0) == 1.0  # clamped
+
+
+def test_nothing_is_paid_beyond_the_finish():
+    world = at(109.9)
+    world.place((110.1, 0.0, STANDING))
+    world.advance()
+    world.place((110.5, 0.0, STANDING))
+    assert float(world.advance().terms["progress"][0, 0]) == 0.0
+
+
+@pytest.mark.parametrize(("y", "out"), [(0.79, False), (0.81, True), (-0.79, False), (-0.81, True)])
+def test_the_lane(y: float, out: bool):
+    world = at(5.0)
+    world.place((5.2, y, STANDING))
+    assert bool(world.advance().terminated[0, 0]) is out
+
+
+def test_a_fall_ends_the_race_where_it_happened():
+    world = at(99.0)
+    world.env.memory["start_x"][:] = 0.0
+    world.place((100.0, 0.0, STANDING))
+    assert not world.advance({"L_Toe": 900.0}).terminated[0, 0]
+    assert not world.advance({"L_Hand": 49.0}).terminated[0, 0]
+    step = world.advance({"L_Hand": 51.0})
+    assert step.terminated[0, 0]
+    assert step.metrics["success"][0] == 0.0
+    assert step.metrics["distance"][0] == pytest.approx(100.0, abs=1e-4)
+    assert math.isnan(step.metrics["time"][0])
+
+
+def test_the_finish_is_the_first_step_beyond_110_m_and_does_not_end():
+    world = at(109.0)
+    world.place((109.9, 0.0, STANDING))
+    before = world.advance()
+    assert not before.success[0] and math.isnan(before.metrics["time"][0])
+    world.place((110.3, 0.0, STANDING))
+    clock = int(world.env.view.clock[0])  # control steps until now
+    step = world.advance()
+    assert step.success[0] and not step.terminated[0, 0]
+    assert step.metrics["time"][0] == pytest.approx((clock + 0.25) / 30, abs=1e-4)
+    # The distance goes on, the time stays, and stepping back loses neither.
+    for x in (114.0, 122.0, 109.0):
+        world.place((x, 0.0, STANDING))
+        last = world.advance()
+    assert last.success[0] and not last.terminated[0, 0]
+    assert last.metrics["distance"][0] == pytest.approx(122.0 - 109.0, abs=1e-4)
+    assert last.metrics["time"][0] == step.metrics["time"][0]
+    assert last.metrics["upright"][0] == 1.0
+
+
+def test_a_fall_beyond_the_finish_ends_the_count_and_one_on_it_is_none():
+    world = at(109.9)
+    world.place((110.3, 0.0, STANDING))
+    world.advance()
+    world.place((115.0, 0.0, STANDING))
+    step = world.advance({"R_Hand": 60.0})
+    assert step.terminated[0, 0] and step.success[0]
+    assert step.metrics["upright"][0] == 0.0
+    assert step.metrics["distance"][0] == pytest.approx(115.0 - 109.9, abs=1e-4)
+    world = at(109.9)
+    world.place((110.3, 0.0, STANDING))
+    step = world.advance({"R_Hand": 60.0})
+    assert step.terminated[0, 0] and not step.success[0]
+
+
+def test_the_finish_may_end_the_episode():
+    world = at(109.8, finish_ends=True)
+    world.place((109.9, 0.0, STANDING))
+    assert not world.advance().terminated[0, 0]
+    world.place((110.1, 0.0, STANDING))
+    step = world.advance()
+    assert step.terminated[0, 0] and step.success[0]
+
+
+@pytest.mark.parametrize(("clearance", "through"), [(-0.095, False), (-0.105, True)])
+@pytest.mark.parametrize("k", [0, 6, 9])
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_foot_goes_over_the_hurdle(k: int, way: int, clearance: float, through: bool):
+    """Forward or back, the lowest joint just above or below what is tolerated under the top."""
+    z = 0.9 + clearance + TOE
+    world = at(HURDLE_X[k] - 0.25 * way, z=z, height=0.9)
+    world.place((HURDLE_X[k] + 0.25 * way, 0.0, z))
+    step = world.advance()
+    assert bool(step.terminated[0, 0]) is through
+    assert step.metrics["hurdles"][0] == (1.0 if way == 1 else 0.0)
+
+
+@pytest.mark.parametrize(("before", "after", "through"), [(-0.16, 0.0, False), (-0.24, 0.0, True)])
+def test_the_height_is_that_at_the_hurdle(before: float, after: float, through: bool):
+    """Rising through what is tolerated within a step: the toe is at the plane half-way, 0.08 or
+    0.12 m under the top."""
+    toe_x = 0.0068 + 0.0045 + 0.0437 - 0.1193  # behind the root
+    world = at(HURDLE_X[2] + toe_x - 0.2, z=0.9 + TOE + before, height=0.9)
+    world.place((HURDLE_X[2] + toe_x + 0.2, 0.0, 0.9 + TOE + after))
+    # The ankle and knee joints pass at other times, but higher.
+    assert bool(world.advance().terminated[0, 0]) is through
+
+
+@pytest.mark.parametrize(("roll", "through"), [(-90, False), (0, True)])
+def test_an_arm_may_pass_beside_the_hurdle_and_a_leg_may_not(roll: float, through: bool):
+    """Rolled onto its side in the air, the left arm of the T-pose hangs 0.8 m down."""
+    world = HandMade("hurdling", height=1.067)
+    half = math.radians(roll) / 2
+    world.state.qpos[:, 3:7] = torch.tensor([math.cos(half), math.sin(half), 0.0, 0.0])
+    world.place((HURDLE_X[0] - 0.4, 0.0, 1.25))
+    world.begin()
+    hand = world.env.physics.scene.body.link_index("L_Hand")
+    assert (world.env.physics.body_pos[0, 0, hand, 2] < 0.6) == (roll != 0)
+    world.place((HURDLE_X[0] + 0.4, 0.0, 1.25))
+    assert bool(world.advance().terminated[0, 0]) is through
+
+
+def test_a_training_start_is_the_race_from_a_hurdle_on():
+    n = 512
+    env = make_env("hurdling", num_worlds=n, seed=3, physics_options={"threads": 1})
+    memory, x = env.memory, env.physics.qpos[:, 0].clone()
+    first = torch.round(x / 9.14).long()
+    assert torch.allclose(x, 9.14 * first, atol=1e-4)
+    assert torch.bincount(first, minlength=10).min() > 25  # 51 in the mean
+    ahead = torch.arange(10) >= first[:, None]
+    heights = memory["marks"][:, :10, 2]
+    assert (heights[~ahead] == 0.0).all() and (heights[ahead] > 0.0).all()
+    assert (heights <= 0.3).all() and abs(float(heights[ahead].mean()) - 0.15) < 0.01
+    # Every hurdle has a height of its own, and the fixtures stand at these heights.
+    assert heights[ahead].unique().numel() == int(ahead.sum())
+    z = env.physics.mocap_pos[..., 2]
+    assert torch.equal(z[ahead], heights[ahead]) and (z[~ahead] < -0.05).all()
+    # Nothing given counts.
+    step = env.task.advance(env.view, memory)
+    assert step.metrics["distance"].abs().max() < 1e-4
+    assert step.metrics["hurdles"].abs().max() == 0.0
+    # A finish from a hurdle on has no time; one from the line has.
+    memory["marks"][:, :10, 2] = 0.0
+    state = PhysicsState(env.physics.qpos.clone(), env.physics.qvel, env.physics.mocap_pos)
+    state.qpos[:, 0] = 111.0
+    env.physics.reset(torch.ones(n, dtype=torch.bool), state)
+    env.view.refresh()
+    step = env.task.advance(env.view, memory)
+    assert step.success.all()
+    assert torch.equal(step.metrics["time"].isnan(), first > 0)
+    assert torch.allclose(step.metrics["distance"], 111.0 - x, atol=1e-3)
+    assert torch.equal(step.metrics["hurdles"], 10.0 - first)
+
+
+def test_evaluation_and_the_ablation_are_the_race():
+    for training, options in ((False, {}), (True, {"curriculum": False})):
+        env = make_env("hurdling", num_worlds=8, training=training, options=options)
+        assert (env.physics.qpos[:, 0] == 0.0).all()
+        assert torch.allclose(env.memory["marks"][:, :10, 2], torch.tensor(1.067))
+        assert torch.allclose(env.physics.mocap_pos[..., 2], torch.tensor(1.067))
+        assert env.memory["whole"].all()
+    env = make_env("hurdling", num_worlds=8, options={"height": 0.8})
+    heights = env.memory["marks"][:, :10, 2]
+    assert torch.isclose(heights[heights > 0], torch.tensor(0.8)).all()
+
+
+def test_a_demonstration_starts_where_it_is():
+    env = make_env("hurdling", num_worlds=4)
+    state = default_state(env.physics.scene, 4, "cpu")
+    state.qpos[:, 0] = 12.5
+    nan = math.nan
+    context = {"hurdle_height": torch.tensor([0.9, nan, 1.067, nan])}
+    state, context = env.task.start(env.view, state, context, env.generator, True)
+    assert context["standing"].tolist() == [False, True, False, True]
+    assert state.qpos[[0, 2], 0].tolist() == [12.5, 12.5]
+    heights = context["marks"][[0, 2], :10, 2]
+    assert torch.allclose(heights, torch.tensor([[0.9], [1.067]]).expand(2, 10))
+    assert (context["first"][[0, 2]] == 0.0).all()
+
+
+def test_a_finish_over_a_high_hurdle_raises_the_next_ones():
+    world = HandMade("hurdling", num_worlds=6)
+    world.place((109.0, 0.0, STANDING))
+    world.begin()
+    env = world.env
+    env.view.curriculum = {"h_max": torch.tensor([0.5, 0.5, 0.5, 0.5, 1.1, 1.167])}
+    step = world.advance()
+    step.success = torch.tensor([True, True, True, False, True, True])
+    env.memory["highest"] = torch.tensor([0.41, 0.39, 0.5, 0.5, 1.0, 1.0])
+    env.memory["standing"] = torch.tensor([True, True, False, True, True, True])
+    everyone = torch.ones(6, dtype=torch.bool)
+    assert env.task.promote is not None
+    raised = env.task.promote(env.view, env.memory, step, everyone)["h_max"]
+    # Proven; too low; a demonstration; no finish; up to the most; there already.
+    expected = torch.tensor([0.6, 0.5, 0.5, 0.5, MOST_MAX, MOST_MAX])
+    torch.testing.assert_close(raised, expected)
+    kept = env.task.promote(env.view, env.memory, step, ~everyone)["h_max"]
+    assert torch.equal(kept, env.view.curriculum["h_max"])
+
+
+def test_the_highest_hurdle_is_one_that_was_passed():
+    world = at(13.0, z=HIGH)
+    heights = torch.tensor([0.4, 0.7, 0.6, 1.0, 0, 0, 0, 0, 0, 0])
+    world.env.memory["marks"][:, :10, 2] = heights
+    seen = []
+    for x in (14.0, 22.0, 23.5, 32.5, 40.0, 30.0):
+        world.place((x, 0.0, HIGH))
+        step = world.advance()
+        seen.append((float(world.env.memory["highest"][0]), float(step.metrics["hurdles"][0])))
+    expected = [(0.4, 1), (0.4, 1), (0.7, 2), (0.7, 3), (0.7, 3), (0.7, 3)]
+    assert seen == [(pytest.approx(h), n) for h, n in expected]
+
+
+def thrown(speeds: list[float], z: float, **options: Any):
+    """Athletes thrown at the first hurdle in the T-pose, one for each speed (m/s)."""
+    n = len(speeds)
+    options = {"height": 1.067, **options}
+    env = make_env("hurdling", num_worlds=n, training=False, options=options)
+    state = default_state(env.physics.scene, n, "cpu")
+    state.qpos[:, 0], state.qpos[:, 2] = 13.1, z
+    state.qvel[:, 0] = torch.tensor(speeds)
+    env.physics.reset(torch.ones(n, dtype=torch.bool), state)
+    env.view.refresh()
+    marks = env.memory["marks"]
+    standing = torch.ones(n, dtype=torch.bool)
+    context = {"marks": marks, "standing": standing, "first": torch.zeros(n)}
+    env.memory = env.task.begin(env.view, context)
+    return env
+
+
+def test_a_hurdle_stops_the_slow_and_nobody_runs_through_it():
+    """Touching ends nothing. At 15 m/s the engine lets legs through the board: the rules do not."""
+    env = thrown([2.0, 15.0], STANDING)
+    results = [env.step(torch.zeros(2, 1, 69)) for _ in range(7)]
+    slow = torch.stack([r.metrics["distance"][0] for r in results])
+    assert (slow < 13.72 - 13.1).all() and slow[-1] > 0.05
+    assert not any(r.terminated[0, 0] for r in results)
+    assert any(r.terminated[1, 0] for r in results[:3])
+
+
+def test_whoever_is_thrown_over_the_hurdle_has_cleared_it():
+    env = thrown([8.0], 2.3)
+    for _ in range(6):
+        result = env.step(torch.zeros(1, 1, 69))
+        assert not result.terminated.any()
+    assert result.metrics["hurdles"][0] == 1.0
+    # Kinematics: no farther than the largest speed takes it, and in flight that is the speed.
+    distance, speed = result.metrics["distance"][0], result.metrics["top_speed"][0]
+    assert 6 / 30 >= float(least_time(distance, speed)) - 1e-3
+    assert float(distance) == pytest.approx(8.0 * 6 / 30, abs=0.02)
+    assert float(speed) == pytest.approx(8.0, abs=0.3)
+
+
+def test_a_toppling_hurdle_yields_to_what_the_rules_ask_for():
+    """3.6 to 4 kg at the top of 10 kg; independent: moments about the ends of the rails."""
+    for height in (0.762, 0.914, 1.067):
+        shapes = toppling_shapes(height)
+        mass = sum(s.mass for s in shapes)
+        ends = [s.end[0] for s in shapes if s.end is not None]
+        middles = [(s.center[0] + s.end[0]) / 2 if s.end else s.center[0] for s in shapes]
+        moment = sum(s.mass * (ends[0] - x) for s, x in zip(shapes, middles))
+        assert mass == pytest.approx(10.0)
+        assert 3.6 * 9.81 < moment * 9.81 / height < 4.0 * 9.81
+        box = shapes[0]
+        assert box.center[2] + box.size[2] == pytest.approx(height)
+        assert min(s.center[0] - s.size[0] for s in shapes) > -0.70
+
+
+def test_toppling_hurdles_stand_until_they_are_hit():
+    env = thrown([5.0, 0.0], STANDING + 0.02, toppling=True)
+    scene = env.physics.scene
+    rest = env.physics.object_pos.clone()
+    knocked = torch.zeros(2)
+    for step in range(25):
+        result = env.step(torch.zeros(2, 1, 69))
+        if step < 4:  # the board is hit and the athlete still on its feet
+            assert not result.terminated.any()
+        knocked = torch.maximum(knocked, result.metrics["knocked"])
+    moved = (env.physics.object_pos - rest).abs()
+    assert moved[:, 1:].max() < 1e-3 and moved[1].max() < 1e-3
+    assert knocked.tolist() == [1.0, 0.0]
+    assert scene.nv == 75 + 60
+
+
+def test_a_knocked_hurdle_is_seen_lying_and_bars_nobody():
+    world = HandMade("hurdling", toppling=True)
+    place = world.env.physics.scene.object_qpos("hurdle0")
+    legs = {"x": HURDLE_X[0] - 0.25, "beyond": HURDLE_X[0] + 0.25}
+    for flat in (False, True):
+        turn = math.pi / 2 * flat
+        quat = (math.cos(turn / 2), 0.0, math.sin(turn / 2), 0.0)
+        world.state.qpos[:, place.start + 3 : place.stop] = torch.tensor(quat)
+        world.place((legs["x"], 0.0, 1.0))
+        world.begin()
+        top = world.env.task.features(world.env.view, world.env.memory)["hurdles"][0, 0, :3]
+        expected = (0.25 + 1.067 * flat, 0.0, 1.067 * (not flat) - 1.0)
+        assert top.tolist() == pytest.approx(expected, abs=1e-4)
+        world.place((legs["beyond"], 0.0, 1.0))
+        step = world.advance()
+        assert bool(step.terminated[0, 0]) is not flat
+        assert step.metrics["knocked"][0] == float(flat)
+
+
+def test_a_toppling_start_has_the_hurdles_before_it_aside():
+    env = make_env("hurdling", num_worlds=64, options={"toppling": True})
+    first = torch.round(env.physics.qpos[:, 0] / 9.14)
+    y = env.physics.object_pos[..., 1]
+    assert torch.equal(y > 3.0, torch.arange(10) < first[:, None])
+    assert first.unique().numel() > 5
+    assert (env.curriculum["h_max"] == MOST_MAX).all()
+
+
+def test_nobody_earns_more_than_the_way():
+    """64 worlds of random motion: finite, and the return is at most the way to the finish."""
+    env = make_env("hurdling", num_worlds=64, seed=2)
+    generator = torch.Generator().manual_seed(0)
+    left, paid, ends = env.memory["left"].clone(), torch.zeros(64), 0
+    reach, clock = torch.zeros(64), torch.zeros(64)
+    for _ in range(200):
+        result = env.step(0.4 * torch.randn(64, 1, 69, generator=generator))
+        assert torch.isfinite(result.obs).all() and torch.isfinite(result.reward).all()
+        paid, clock = paid + result.reward[:, 0], clock + 1
+        assert (paid <= left).all()
+        reach = result.metrics["distance"]
+        # 0.5 m/s: what a link's push within a step may add to the speeds at the ends of steps.
+        least = least_time(reach, result.metrics["top_speed"] + 0.5)
+        assert (least <= clock / 30 + 1e-3).all()
+        ended = result.ended
+        ends += int(ended.sum())
+        paid, clock = paid.masked_fill(ended, 0.0), clock.masked_fill(ended, 0.0)
+        left = torch.where(ended, env.memory["left"], left)
+    assert ends > 64 and env.physics.nan_worlds == 0
+
+
+@pytest.mark.parametrize("toppling", [False, True])
+def test_permuting_the_worlds_permutes_every_output(toppling: bool):
+    n = 6
+    order = torch.tensor([3, 0, 5, 1, 4, 2])
+    options = {"toppling": toppling}
+    straight, permuted = (
+        make_env("hurdling", num_worlds=n, training=False, options=options) for _ in range(2)
+    )
+    scene = straight.physics.scene
+    state = default_state(scene, n, "cpu")
+    generator = torch.Generator().manual_seed(7)
+    state.qpos[:, 7:76] = 0.1 * torch.randn(n, 69, generator=generator)
+    state.qpos[:, 0] = torch.tensor([0.0, 13.3, 22.4, 50.0, 95.6, 109.9])
+    state.qvel[:, 0] = torch.linspace(0.0, 10.0, n)
+    marks = straight.memory["marks"].clone()
+    if not toppling:
+        marks[:, :10, 2] = torch.rand(n, 10, generator=generator)
+        state.mocap_pos[..., 2] = marks[:, :10, 2]
+    everyone = torch.ones(n, dtype=torch.bool)
+    for env, rows in ((straight, torch.arange(n)), (permuted, order)):
+        rows_state = PhysicsState(state.qpos[rows], state.qvel[rows], state.mocap_pos[rows])
+        env.physics.reset(everyone, rows_state)
+        env.view.refresh()
+        first = torch.arange(n)[rows].float()
+        context = {"marks": marks[rows], "standing": everyone, "first": first}
+        env.memory = env.task.begin(env.view, context)
+    for _ in range(12):
+        action = 0.3 * torch.randn(n, 1, 69, generator=generator)
+        a, b = straight.step(action), permuted.step(action[order])
+        for name in ("obs", "final_obs", "reward", "terminated", "truncated", "valid"):
+            assert torch.equal(getattr(a, name)[order], getattr(b, name)), name
+        for name, value in a.metrics.items():
+            assert torch.equal(value[order].nan_to_num(-1), b.metrics[name].nan_to_num(-1)), name
+
+
+def test_a_saved_state_continues_bit_for_bit():
+    generator = torch.Generator().manual_seed(2)
+    actions = 0.3 * torch.randn(60, 4, 1, 69, generator=generator)
+    first = make_env("hurdling", num_worlds=4, seed=1)
+    twin = make_env("hurdling", num_worlds=4, seed=1)
+    ends = 0
+    for action in actions[:30]:
+        a, b = first.step(action), twin.step(action)
+        assert torch.equal(a.obs, b.obs) and torch.equal(a.reward, b.reward)
+        ends += int(a.ended.sum())
+    second = make_env("hurdling", num_worlds=4, seed=9)
+    second.load_state_dict(first.state_dict())
+    for action in actions[30:]:
+        a, b = first.step(action), second.step(action)
+        assert torch.equal(a.obs, b.obs) and torch.equal(a.reward, b.reward)
+        ends += int(a.ended.sum())
+    assert ends >= 6
+
+
+@pytest.mark.parametrize("toppling", [False, True])
+def test_mujoco_and_warp_agree(toppling: bool):
+    """The start pose held for 30 steps: at the line, and behind a hurdle at 0.1 m."""
+    pytest.importorskip("mujoco_warp")
+    scene = make_scene("hurdling", options={"toppling": toppling})
+    engines = [make_physics("mujoco", scene, 2, threads=1)]
+    engines.append(make_physics("warp", scene, 2, device="cpu"))
+    state = default_state(scene, 2, "cpu")
+    state.qpos[1, 0] = HURDLE_X[3] - 0.3
+    for physics in engines:
+        physics.reset(torch.ones(2, dtype=torch.bool), state)
+    ctrl = torch.zeros(2, scene.nu)
+    for _ in range(30):
+        for physics in engines:
+            physics.step(ctrl)
+    c, w = engines
+    worst = float((c.qpos - w.qpos).abs().max())
+    print(f"mujoco against warp, 1 s, toppling {toppling}: |dqpos| = {worst:.1e}")
+    assert worst < 1e-4
+    assert int(w.overflow) == 0 and int(w.nan_worlds) == 0
+
+
+def test_mujoco_and_warp_meet_the_same_hurdle_in_every_world():
+    """At 4 m/s, the feet off the ground, against hurdles of 1.067, 0.6 and 0.3 m, and none."""
+    pytest.importorskip("mujoco_warp")
+    scene, n = make_scene("hurdling"), 4
+    engines = [make_physics("mujoco", scene, n, threads=1)]
+    options = {"iterations": 50, "line_search": 50}
+    engines.append(make_physics("warp", scene, n, device="cpu", **options))
+    state = default_state(scene, n, "cpu")
+    state.qpos[:, 0], state.qvel[:, 0] = HURDLE_X[4] - 0.4, 4.0
+    state.qpos[:, 2] += 0.1
+    state.mocap_pos[..., 2] = torch.tensor([1.067, 0.6, 0.3, -0.1])[:, None]
+    for physics in engines:
+        physics.reset(torch.ones(n, dtype=torch.bool), state)
+        for _ in range(7):
+            physics.step(torch.zeros(n, scene.nu))
+    c, w = engines
+    worst = float((c.qpos - w.qpos).abs().max())
+    print(f"mujoco against warp at hurdles: |dqpos| = {worst:.1e}, x {c.qpos[:, 0].tolist()}")
+    assert worst < 0.01  # 0.005 rad at a hip after shins of 4 m/s met the flat of a board
+    toes = c.body_pos[:, 0, [scene.body.link_index(k) for k in ("L_Toe", "R_Toe")], 0].amax(-1)
+    assert (toes[:3] < HURDLE_X[4]).all() and toes[3] > HURDLE_X[4]
+
+
+def test_warp_has_room_for_athletes_on_a_hurdle():
+    """Thrown on it in all attitudes with random limbs: no buffer overflows."""
+    pytest.importorskip("mujoco_warp")
+    scene, n = make_scene("hurdling"), 8
+    physics = make_physics("warp", scene, n, device="cpu")
+    generator = torch.Generator().manual_seed(0)
+    state = default_state(scene, n, "cpu")
+    state.qpos[:, 7:] += 0.8 * torch.randn(n, 69, generator=generator)
+    state.qpos[:, 3:7] = torch.nn.functional.normalize(torch.randn(n, 4, generator=generator))
+    state.qpos[:, 0], state.qpos[:, 2] = HURDLE_X[0] - 0.1, 1.1
+    physics.reset(torch.ones(n, dtype=torch.bool), state)
+    for _ in range(15):
+        physics.step(torch.randn(n, scene.nu, generator=generator))
+    assert int(physics.overflow) == 0 and int(physics.nan_worlds) == 0
+
+
+@pytest.mark.parametrize("toppling", [False, True])
+def test_drake_builds_and_runs(toppling: bool):
+    """The start pose, and an athlete at 2 m/s whom the hurdle stops as in MuJoCo."""
+    pytest.importorskip("pydrake")
+    scene = make_scene("hurdling", options={"toppling": toppling})
+    paths = []
+    for engine in ("mujoco", "drake"):
+        physics = make_physics(engine, scene, 2)
+        state = default_state(scene, 2, "cpu")
+        state.qpos[1, 0] = HURDLE_X[0] - 0.6
+        state.qvel[1, 0] = 2.0
+        physics.reset(torch.ones(2, dtype=torch.bool), state)
+        for _ in range(15):
+            physics.step(torch.zeros(2, scene.nu))
+        assert not physics.bad.any()
+        paths.append(physics.qpos.clone())
+        if not toppling:
+            assert torch.allclose(physics.mocap_pos[..., 2], torch.tensor(1.067))
+    mujoco, drake = paths
+    gap = (drake - mujoco)[:, :3].abs()
+    print(f"drake against mujoco, 0.5 s, toppling {toppling}: {gap.amax(-1).tolist()} m")
+    assert gap[0].max() < 0.02
+    if not toppling:
+        assert gap[1].max() < 0.1
+        assert (drake[1, 0] < HURDLE_X[0]) and (mujoco[1, 0] < HURDLE_X[0])
+
+
+def test_wrong_options_are_one_sentence():
+    task = get_task("hurdling")
+    with pytest.raises(ValueError, match=r"a hurdle must be 0\.0 to 1\.2 m high, not 1\.3"):
+        make_config(task, {"height": 1.3})
+    with pytest.raises(ValueError, match=r"a toppling hurdle must be 0\.3 to 1\.1 m high"):
+        make_config(task, {"height": 0.0, "toppling": True})
+    assert make_config(task, {"height": 0.0}).height == 0.0
