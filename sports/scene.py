@@ -15,6 +15,9 @@ import numpy as np
 
 from sports.humanoid.body import Body, Shape
 
+GROUND = "ground"
+"""The plane z = 0, as a contact side."""
+
 
 @dataclass(frozen=True)
 class Start:
@@ -50,6 +53,10 @@ class SceneObject:
     """Whether the object collides with the ground plane."""
     solref: tuple[float, float] | None = None
     """MuJoCo contact reference (time constant s, damping ratio); None for the default."""
+    impedance: float | None = None
+    """Share of the acceleration of its contacts that MuJoCo prescribes; the rest yields to load.
+    Given, the contacts are as the object says, whatever it meets; None mixes MuJoCo's default with
+    the other side's. Friction creeps as the rest yields: what a hand holds needs nearly 1."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,8 @@ class Scene:
     objects: tuple[SceneObject, ...] = ()
     contact_pairs: tuple[tuple[str, str], ...] = ()
     """Pairs reported in ``Physics.pair_force``; each side is ``"agent0"`` (all its links), a
-    link ``"agent0/L_Hand"``, one of its shapes ``"agent0/L_Hand:1"``, or an object's name."""
+    link ``"agent0/L_Hand"``, one of its shapes ``"agent0/L_Hand:1"``, an object's name, or (the
+    second side) ``"ground"``."""
     link_contacts: bool = False
     """Whether ``Physics.link_force`` is wanted."""
     timestep: float = 1.0 / 120.0
@@ -79,6 +87,8 @@ class Scene:
     offset: Mapping[str, float] = field(default_factory=dict)
     """PD targets (rad) of action 0 by dof, of every athlete; 0 for the others. An athlete who
     holds something goes on holding it with action 0."""
+    steady: frozenset[str] = frozenset()
+    """Dofs without noise at the start: those between two things that hold each other."""
     sites: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Named marks drawn by the renderer (goal, line), world frame (m)."""
 

@@ -18,9 +18,8 @@ import mujoco
 import numpy as np
 
 from sports.humanoid.body import Body, Shape
-from sports.scene import Scene, SceneObject, humanoid_scene
+from sports.scene import GROUND, Scene, SceneObject, humanoid_scene
 
-GROUND = "ground"
 _KIND = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -120,11 +119,14 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
         }
         if obj.solref is not None:
             fields["solref"] = obj.solref
+        if obj.impedance is not None:
+            fields["solimp"] = (obj.impedance, obj.impedance, 0.001, 0.5, 2.0)
+            fields["priority"] = 1
         _add_shape(node, shape, **fields)
 
 
 def _side(scene: Scene, name: str) -> tuple[mujoco.mjtObj, str]:
-    if ":" in name:
+    if ":" in name or name == GROUND:
         return mujoco.mjtObj.mjOBJ_GEOM, name
     if "/" in name:
         return mujoco.mjtObj.mjOBJ_BODY, name
