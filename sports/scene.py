@@ -53,10 +53,9 @@ class SceneObject:
     """Whether the object collides with the ground plane."""
     solref: tuple[float, float] | None = None
     """MuJoCo contact reference (time constant s, damping ratio); None for the default."""
-    impedance: float | None = None
-    """Share of the acceleration of its contacts that MuJoCo prescribes; the rest yields to load.
-    Given, the contacts are as the object says, whatever it meets; None mixes MuJoCo's default with
-    the other side's. Friction creeps as the rest yields: what a hand holds needs nearly 1."""
+    holdable: bool = False
+    """Whether hands can hold it: its contacts with athletes are then firm (``mjcf.HOLD_SOLREF``),
+    whatever ``solref`` says; in MuJoCo's usual ones friction creeps by centimetres a second."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,9 @@
    is at rest under constant torques is at rest under every stiffer servo.
 4. *Stand*: the torques of trunk and legs are those that carry the weight over the feet (statics:
    the ground's force acts below the centre of mass, shared by the feet as levers).
-5. *Prove*: the athlete stands free for 3 s at every strength; the hold in which the object moves
+5. *Balance*: toes that give way under the load tip the athlete a little; the ankles' torques are
+   corrected (secant rule) until the root stays where it is.
+6. *Prove*: the athlete stands free for 3 s at every strength; the hold in which the object moves
    least is kept.
 
 Where the hand meets the object and how hard it presses is drawn at random from ``Search``, with
@@ -59,6 +61,10 @@ PINNED, FREE, FROZEN = 1.0, 1.5, 1.0
 """Seconds of squeezing: object pinned, object free, targets frozen."""
 PASSES = 2
 """Reaches, each corrected by what the squeezing before it moved."""
+SWAY, SECANTS = 1.5, 4
+"""Seconds of standing after which the athlete should be where it was, and corrections."""
+ASTRAY = 0.05
+"""An object that squeezing moved further (m) was lost; one on the ground lies very still."""
 PROOF = 3.0
 """Seconds that a hold must stand."""
 ARM = ("Thorax", "Shoulder", "Elbow", "Wrist")
@@ -124,7 +130,7 @@ def _basketball_reaches(p: dict[str, float]) -> tuple[Reach, ...]:
         outward = np.array([-math.sin(p["behind"]), 0.0, -math.sin(p["below"])])
         outward[1] = (1.0 if side == "L" else -1.0) * math.sqrt(1.0 - outward @ outward)
         mirror = mirrored_axis(side)
-        palm = np.array([-0.003, -p["place"], -0.0166]) * mirror
+        palm = np.array([-0.015, -p["place"], -0.0166]) * mirror
         tips = np.array([math.cos(p["rise"]), 0.0, math.sin(p["rise"])])
         fingers = tips - (tips @ outward) * outward
         axes = (
@@ -147,7 +153,7 @@ SEARCHES = {
     "basketball": Search(
         held=BASKETBALL,
         ranges={
-            "place": (0.05, 0.1),
+            "place": (0.08, 0.11),
             "behind": (0.0, 0.5),
             "below": (0.0, 0.5),
             "rise": (0.0, 1.2),
@@ -332,10 +338,12 @@ def try_hold(name: str, parameters: dict[str, float], seed: int) -> Hold:
         rest, torque = squeeze(rig, qpos, reaches, search.torques(parameters))
         # Squeezing moves the object by millimetres: reach as much to the other side.
         error = rest[slot][:3] - wanted
+        if np.linalg.norm(error) > ASTRAY:
+            raise ValueError(f"the object came to {rest[slot][:3]}, not to {wanted}")
         reaches = tuple(replace(r, place=r.place - error) for r in reaches)
     dofs = [dof.name for dof in rig.body.dofs]
     place, attitude = rest[slot][:3].round(6).tolist(), _unrolled(rest[slot][3:]).round(6).tolist()
-    return Hold(
+    hold = Hold(
         name=name,
         root_height=round(float(rest[2]), 6),
         angles=dict(zip(dofs, rest[7 : 7 + rig.n].round(6).tolist())),
@@ -344,6 +352,7 @@ def try_hold(name: str, parameters: dict[str, float], seed: int) -> Hold:
         quat=(attitude[0], attitude[1], attitude[2], attitude[3]),
         hands=hands,
     )
+    return balance(hold)
 
 
 def _unrolled(quat: np.ndarray) -> np.ndarray:
@@ -353,6 +362,24 @@ def _unrolled(quat: np.ndarray) -> np.ndarray:
     yaw, pitch = math.atan2(nose[1], nose[0]), math.asin(nose[2])
     cy, sy, cp, sp = (f(v / 2) for v in (yaw, pitch) for f in (math.cos, math.sin))
     return np.array([cy * cp, sy * sp, -cy * sp, sy * cp])
+
+
+def balance(hold: Hold) -> Hold:
+    """The hold with that torque of the ankles with which the athlete sways least."""
+
+    def corrected(torque: float) -> Hold:
+        ankles = {f"{side}_Ankle_y": torque for side in "LR"}
+        torques = {dof: round(t + ankles.get(dof, 0.0), 5) for dof, t in hold.torques.items()}
+        return replace(hold, torques=torques)
+
+    first, second = 0.0, 1.0
+    way = prove(hold, "human", seconds=SWAY).swayed
+    for _ in range(SECANTS):
+        now = prove(corrected(second), "human", seconds=SWAY).swayed
+        if abs(now - way) < 1e-6:
+            break
+        first, second, way = second, second - now * (second - first) / (now - way), now
+    return corrected(second)
 
 
 class Proof(NamedTuple):
@@ -366,6 +393,8 @@ class Proof(NamedTuple):
     """Object's way in the last second (m)."""
     sunk: float
     """How far the root came down (m)."""
+    swayed: float
+    """How far forward the root was in the end (m)."""
 
 
 def prove(
@@ -380,12 +409,12 @@ def prove(
     state = default_state(scene, 1, physics.device)
     physics.reset(torch.ones(1, dtype=torch.bool), state)
     ctrl = torch.tensor(scene.action_offset(), dtype=torch.float32)[None]
-    pos, quat, height = [], [], []
+    pos, quat, root = [], [], []
     for _ in range(round(seconds / scene.control_timestep)):
         physics.step(ctrl)
         pos.append(physics.object_pos[0, 0].clone())
         quat.append(physics.object_quat[0, 0].clone())
-        height.append(float(physics.body_pos[0, 0, 0, 2]))
+        root.append(physics.body_pos[0, 0, 0].clone())
     way = torch.stack(pos).double() - torch.tensor(hold.pos)
     same = (torch.stack(quat).double() @ torch.tensor(hold.quat).double()).abs().clamp(max=1.0)
     physics.close()
@@ -393,7 +422,8 @@ def prove(
         moved=float(way.norm(dim=-1).max()),
         turned=float(2 * torch.arccos(same).max()),
         creep=float((way[-1] - way[max(-31, -len(way))]).norm()),
-        sunk=hold.root_height - min(height),
+        sunk=hold.root_height - float(torch.stack(root)[:, 2].min()),
+        swayed=float(root[-1][0]),
     )
 
 

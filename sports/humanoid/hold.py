@@ -19,8 +19,6 @@ import numpy as np
 from sports.humanoid.body import Body, Shape
 from sports.scene import Scene, SceneObject, Start
 
-FIRM = (1.0 / 120.0, 1.0)
-"""Contact time (s, the least at 1/240 s) and damping ratio of what fingers hold."""
 JAVELIN_LENGTH, JAVELIN_RADIUS = 2.7, 0.0125
 """m; the men's javelin is 2.6 to 2.7 m long and 25 to 30 mm thick (World Athletics)."""
 NOSE_UP = math.radians(30.0)
@@ -33,8 +31,7 @@ JAVELIN = SceneObject(
     quat=(math.cos(NOSE_UP / 2), 0.0, -math.sin(NOSE_UP / 2), 0.0),
     friction=1.0,  # a cord grip in a dry hand
     rgba=(0.85, 0.85, 0.2, 1.0),
-    solref=FIRM,
-    impedance=0.99,
+    holdable=True,
 )
 """The nose is at the end of its +x axis, the grip at the centre of mass."""
 BASKETBALL = SceneObject(
@@ -44,8 +41,7 @@ BASKETBALL = SceneObject(
     pos=(0.35, 0.0, 1.5),
     friction=1.0,
     rgba=(0.85, 0.42, 0.15, 1.0),
-    solref=FIRM,
-    impedance=0.99,
+    holdable=True,
 )
 HELD = {"javelin": JAVELIN, "basketball": BASKETBALL}
 """What the holds are for, by their names."""
@@ -71,8 +67,15 @@ class Hold:
     hands: tuple[str, ...]
     """Sides ("L", "R") of the hands that hold."""
 
-    def start(self) -> Start:
-        """The athlete with the object in its hands, at the origin, facing +x."""
+    def start(self, body: Body) -> Start:
+        """The athlete with the object in its hands, at the origin, facing +x. Raises ValueError
+        for a body that lacks the joints."""
+        missing = set(self.angles) - {dof.name for dof in body.dofs}
+        if missing:
+            raise ValueError(
+                f"the hold of the {self.name} needs the fingers of body 'smplx'; body "
+                f"'{body.name}' has no joint '{min(missing)}'"
+            )
         return Start(pose=self.angles, z=self.root_height)
 
     def targets(self, body: Body) -> dict[str, float]:
@@ -97,7 +100,7 @@ class Hold:
         return Scene(
             name=name,
             body=body,
-            agents=(self.start(),),
+            agents=(self.start(body),),
             objects=(self.placed(held),),
             offset=self.targets(body),
             steady=self.steady(body),
@@ -123,16 +126,6 @@ def load_hold(name: str) -> Hold:
         quat=tuple(data["object"]["quat"]),
         hands=tuple(data["hands"]),
     )
-
-
-def check_links(hold: Hold, body: Body) -> None:
-    """Raises ValueError if the body has not the joints of the hold."""
-    missing = set(hold.angles) - {dof.name for dof in body.dofs}
-    if missing:
-        raise ValueError(
-            f"hold '{hold.name}' is of a body with fingers (smplx); '{body.name}' has no "
-            f"{sorted(missing)[0]}"
-        )
 
 
 def mirrored_axis(side: str) -> np.ndarray:
