@@ -26,7 +26,7 @@ from rl.policy import Policy, load_policy
 from rl.recording import Recording, Tape
 from sports.env import Env, Starts, make_env, make_scene
 from sports.registry import get_task
-from sports.starts import START_NOISE
+from sports.starts import START_NOISE, loose_joints
 
 __all__ = ["EvaluationResult", "Recording", "evaluate", "interval"]
 
@@ -302,7 +302,8 @@ def standing_starts(env: Env, noise: float, seed: int) -> Starts:
     generator = torch.Generator().manual_seed(seed)
     start = torch.tensor(scene.default_qpos()[scene.agent_qpos(0)], dtype=torch.float32)
     qpos = start.repeat(START_FRAMES, 1)
-    qpos[:, 7:] += noise * (2.0 * torch.rand(qpos[:, 7:].shape, generator=generator) - 1.0)
+    draw = 2.0 * torch.rand(qpos[:, 7:].shape, generator=generator) - 1.0
+    qpos[:, 7:] += noise * loose_joints(scene, qpos.device) * draw
     qvel = torch.zeros(START_FRAMES, 6 + scene.body.num_dofs)
     return Starts(qpos, qvel, {}, probability=1.0).to(env.device)
 

@@ -12,6 +12,12 @@ from sports.task import Task
 _TASKS: dict[str, Task] = {
     t.name: t for t in (high_jump.TASK, long_jump.TASK, hurdling.TASK, fencing.TASK, boxing.TASK)
 }
+from sports import high_jump, hurdling, javelin, long_jump
+from sports.humanoid.body import load_body
+from sports.task import Task
+
+_ALL = (high_jump.TASK, long_jump.TASK, hurdling.TASK, javelin.TASK)
+_TASKS: dict[str, Task] = {t.name: t for t in _ALL}
 
 
 def task_names() -> tuple[str, ...]:

@@ -15,6 +15,9 @@ import numpy as np
 
 from sports.humanoid.body import Body, Shape
 
+GROUND = "ground"
+"""The plane z = 0, as a contact side."""
+
 
 @dataclass(frozen=True)
 class Start:
@@ -101,6 +104,9 @@ class Surface:
             raise ValueError(f"surface '{self.name}': a {self.kind} cannot have size {self.size}")
         if self.kind == "waves" and (self.link is not None or self.quat != (1.0, 0.0, 0.0, 0.0)):
             raise ValueError(f"surface '{self.name}': waves lie flat in the world")
+    holdable: bool = False
+    """Whether hands can hold it: its contacts with athletes are then firm (``mjcf.HOLD_SOLREF``),
+    whatever ``solref`` says; in MuJoCo's usual ones friction creeps by centimetres a second."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +124,8 @@ class Scene:
     objects: tuple[SceneObject, ...] = ()
     contact_pairs: tuple[tuple[str, str], ...] = ()
     """Pairs reported in ``Physics.pair_force``; each side is ``"agent0"`` (all its links), a
-    link ``"agent0/L_Hand"``, one of its shapes ``"agent0/L_Hand:1"``, or an object's name."""
+    link ``"agent0/L_Hand"``, one of its shapes ``"agent0/L_Hand:1"``, an object's name, or (the
+    second side) ``"ground"``."""
     link_contacts: bool = False
     """Whether ``Physics.link_force`` is wanted."""
     surfaces: tuple[Surface, ...] = ()
@@ -133,6 +140,8 @@ class Scene:
     offset: Mapping[str, float] = field(default_factory=dict)
     """PD targets (rad) of action 0 by dof, of every athlete; 0 for the others. An athlete who
     holds something goes on holding it with action 0."""
+    steady: frozenset[str] = frozenset()
+    """Dofs without noise at the start: those between two things that hold each other."""
     sites: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Named marks drawn by the renderer (goal, line), world frame (m)."""
 

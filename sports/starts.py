@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sports.physics.base import PhysicsState
 from sports.scene import Scene
-from sports.task import Memory
+from sports.task import Memory, constant
 
 START_NOISE = 0.02
 """Joint noise of a training start (rad), uniform."""
@@ -49,10 +49,16 @@ class Starts:
 
 def add_noise(state: PhysicsState, scene: Scene, generator: torch.Generator) -> None:
     """Moves the joints of standing athletes a little."""
+    noise = START_NOISE * loose_joints(scene, state.qpos.device)
     for agent in range(scene.num_agents):
         joints = state.qpos[:, scene.agent_qpos(agent)][:, 7:]
         draw = torch.rand(joints.shape, device=joints.device, generator=generator)
-        joints += START_NOISE * (2.0 * draw - 1.0)
+        joints += noise * (2.0 * draw - 1.0)
+
+
+def loose_joints(scene: Scene, device: torch.device) -> Tensor:
+    """(num_dofs,) 1 for the joints that may start elsewhere, 0 for those of ``Scene.steady``."""
+    return constant(tuple(float(dof.name not in scene.steady) for dof in scene.body.dofs), device)
 
 
 @dataclass

@@ -14,13 +14,14 @@ docs/physics.md has the measurements.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 
 from sports.humanoid.body import Body, Shape
-from sports.scene import Scene, SceneObject, humanoid_scene
+from sports.scene import GROUND, Scene, SceneObject, humanoid_scene
 
-GROUND = "ground"
 _KIND = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -36,8 +37,12 @@ CONTACT_IMPEDANCE = 0.6
 """Share of a contact's acceleration that is prescribed; the rest yields to the load."""
 CONTACT_SOLIMP = (CONTACT_IMPEDANCE, CONTACT_IMPEDANCE, 0.001, 0.5, 2.0)
 """The impedance in MuJoCo's terms: the same at any depth."""
-# Collision classes: bit 0 everything solid, bit 1 the ground plane.
-_SOLID, _GROUND = 1, 2
+HOLD_SOLREF, HOLD_IMPEDANCE = (1.0 / 120.0, 1.0), 0.99
+"""Contacts of athletes with what they can hold: the least time constant at 1/240 s, critical
+damping, and so little yielding that a held javelin creeps by 0.2 mm/s."""
+# Collision classes: objects, the ground plane, athletes. What can be held has every shape twice:
+# one that meets athletes, one that meets the rest.
+_SOLID, _GROUND, _ATHLETE, _REST = 1, 2, 4, 8
 
 
 def body_name(agent: int, link: str) -> str:
@@ -72,8 +77,8 @@ def _add_agent(spec: mujoco.MjSpec, scene: Scene, agent: int) -> None:
                 shape,
                 name=f"{body_name(agent, link.name)}:{k}",
                 friction=(friction, 0.005, 0.0001),
-                contype=_SOLID,
-                conaffinity=_SOLID | _GROUND,
+                contype=_ATHLETE,
+                conaffinity=_SOLID | _GROUND | _ATHLETE,
                 condim=3,
                 solref=CONTACT_SOLREF,
                 solimp=CONTACT_SOLIMP,
@@ -113,8 +118,8 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
     for shape in obj.shapes:
         fields: dict[str, object] = {
             "friction": (obj.friction, 0.005, 0.0001),
-            "contype": _SOLID,
-            "conaffinity": _SOLID | (_GROUND if obj.meets_ground else 0),
+            "contype": _REST if obj.holdable else _SOLID,
+            "conaffinity": _SOLID | _REST | (_GROUND if obj.meets_ground else 0),
             "condim": 3,
             "rgba": obj.rgba,
         }
@@ -123,10 +128,14 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
         if obj.solref is not None:
             fields["solref"] = obj.solref
         _add_shape(node, shape, **fields)
+        if obj.holdable:
+            fields |= {"contype": 0, "conaffinity": _ATHLETE, "priority": 1, "solref": HOLD_SOLREF}
+            fields["solimp"] = (HOLD_IMPEDANCE, HOLD_IMPEDANCE, 0.001, 0.5, 2.0)
+            _add_shape(node, replace(shape, mass=0.0), **fields)
 
 
 def _side(scene: Scene, name: str) -> tuple[mujoco.mjtObj, str]:
-    if ":" in name:
+    if ":" in name or name == GROUND:
         return mujoco.mjtObj.mjOBJ_GEOM, name
     if "/" in name:
         return mujoco.mjtObj.mjOBJ_BODY, name

@@ -50,6 +50,7 @@ from sports.humanoid.mjcf import build_model
 from sports.physics.base import Geometry, PhysicsState, diverged
 from sports.physics.game import build_game, has_game
 from sports.scene import Scene, SceneObject
+from sports.scene import GROUND, Scene, SceneObject
 
 MAX_TIMESTEP = 1.0 / 480.0
 """Largest time step (s) chosen on its own: standing joints then follow MuJoCo to 1e-3 rad."""
@@ -306,7 +307,7 @@ class DrakePhysics:
 
     def _index_contacts(self) -> None:
         """Tables from Drake's body indices to links and to the scene's pairs."""
-        names: dict[str, list[int]] = {}
+        names: dict[str, list[int]] = {GROUND: [0]}  # nothing else is on the world body
         self._link_of: dict[int, int] = {}
         self._shape_of: dict[GeometryId, int] = {}
         for a, humanoid in enumerate(self._humanoids):

@@ -17,10 +17,11 @@ from torch import Tensor
 
 from sports.ball_law.compiled import for_gpu
 from sports.humanoid.mjcf import GROUND, body_name, build_model
+from sports.humanoid.mjcf import body_name, build_model
 from sports.physics.base import GRAVITY, NO_FORCE, Geometry, PhysicsState, diverged
 from sports.physics.game import build_game, has_game
 from sports.physics.variation import Draw, Variation, contact_softness, draw
-from sports.scene import Scene
+from sports.scene import GROUND, Scene
 
 ITERATIONS, LINE_SEARCH = 5, 8
 """Newton iterations and line-search steps: 10 / 20 cost 10 % more (measured)."""
@@ -233,7 +234,7 @@ def _contact_tables(
         table = np.zeros((model.ngeom, len(scene.contact_pairs)), dtype=np.int32)
         for p, pair in enumerate(scene.contact_pairs):
             one, whole = pair[side], f"{pair[side]}/"
-            if ":" in one:
+            if ":" in one or one == GROUND:
                 table[:, p] = [geom == one for geom in geoms]
             else:
                 table[:, p] = [n == one or n.startswith(whole) for n in names]

@@ -1,0 +1,246 @@
+"""Javelin: from a standing start with the javelin in the right hand, thrown from behind a line.
+
+The athlete starts at the origin in a hold found by simulation (``sports/humanoid/hold.py``) and
+must let go within 1.6 s and stay within 2 m of the start; x = 2 is the foul line. The throw ends
+when any part of the javelin touches the ground: the distance is that point's x - 2. Source:
+SMPLOlympics section 4 for stages and reward; World Athletics technical rules for the line (no part
+of the body may touch the ground on or beyond it, also after the release).
+
+"Hand" is the middle of the right palm, "grip" the javelin's centre of mass. A javelin is released
+when the palm is 0.15 m from the whole shaft and nothing of the athlete touches it. From 1.6 s on it
+is on its own: a hand near the shaft, or a touch by any link, ends the throw as a failure, so nobody
+carries it, kicks it on or catches it again. What touches the ground before the release does not
+count, wherever the tip is. Rewards follow the paper, so a metre of the javelin's flight pays the
+same whether the throw will count or not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sports import quaternion
+from sports.humanoid.body import Body
+from sports.humanoid.hold import JAVELIN, JAVELIN_LENGTH, JAVELIN_RADIUS, NOSE_UP, load_hold
+from sports.physics.base import GRAVITY, PhysicsState
+from sports.scene import GROUND, Scene
+from sports.task import Advance, Memory, Task, View, constant, length, nan_where, squared
+
+LINE_X, HALF_FIELD = 2.0, 2.0
+"""Foul line, and how far from the start the root may be along x and y (m)."""
+HOLD_STEPS, THROW_STEPS, RELEASE_STEPS = 18, 36, 48
+"""Control steps (0.6, 1.2, 1.6 s): the javelin is held; is thrown; must have left the hand."""
+REACH = 0.15
+"""Palm to grip (m) beyond which the grip is lost; palm to shaft beyond which it is let go."""
+MAX_TILT = 0.5
+"""rad off the attitude of the hold while held."""
+PALM = (-0.0029, -0.0537, -0.0044)
+"""Middle of the right palm in the frame of R_Wrist (m): of its box."""
+TOUCH = 1e-3
+"""A support point this close to the ground (m) touches it."""
+END = JAVELIN_LENGTH / 2 - JAVELIN_RADIUS
+"""From the grip to the middle of the round ends (m)."""
+AIM = (math.cos(NOSE_UP), 0.0, math.sin(NOSE_UP))
+"""Where the nose points in the hold."""
+# Weights of grab, start, goal and attitude while it is held, while it is thrown, and later.
+_WEIGHTS = (0.9, 0.0, 0.0, 0.1, -0.05, 0.05, 0.9, 0.0, 0.0, 0.0, 0.9, 0.1)
+
+
+@dataclass(frozen=True)
+class Javelin:
+    """Options of the javelin throw."""
+
+
+def scene(config: Javelin, body: Body) -> Scene:
+    """The athlete with the javelin in its hand. Raises ValueError for a body without fingers."""
+    hold = load_hold("javelin")
+    return Scene(
+        name="javelin",
+        body=body,
+        agents=(hold.start(body),),
+        objects=(hold.placed(JAVELIN),),
+        offset=hold.targets(body),
+        steady=hold.steady(body),
+        contact_pairs=(("agent0", "javelin"), ("javelin", GROUND)),
+        timestep=1.0 / 240.0,
+        substeps=8,
+        sites={"start": (0.0, 0.0, 0.0), "line": (LINE_X, 0.0, 0.0)},
+    )
+
+
+def start(
+    view: View,
+    state: PhysicsState,
+    context: Memory,
+    generator: torch.Generator,
+    training: bool,
+) -> tuple[PhysicsState, Memory]:
+    """Nothing to draw: the scene starts in the hold."""
+    return state, {}
+
+
+def begin(view: View, context: Memory) -> Memory:
+    """Memory after a reset: in the hand."""
+    ends, speeds = _ends(view)
+    zero = torch.zeros_like(ends[:, 0, 0])
+    return {
+        "start": view.root_pos[:, 0].clone(),
+        "x": view.physics.object_pos[:, 0, 0].clone(),
+        "ends": ends,
+        "speeds": speeds,
+        "released": zero > 0,
+        "release_speed": torch.full_like(zero, torch.nan),
+    }
+
+
+def features(view: View, memory: Memory) -> dict[str, Tensor]:
+    """The javelin, the hand and the way from the start, as seen from the athlete (19)."""
+    physics, root = view.physics, view.root_pos
+    vectors = torch.stack(
+        (
+            physics.object_pos - root,
+            physics.object_linvel,
+            physics.object_angvel,
+            _palm(view)[:, None] - root,
+            root - memory["start"][:, None],
+        ),
+        dim=2,
+    )
+    pos, linvel, angvel, hand, way = view.heading.local(vectors).unbind(2)
+    # The heading is a turn about z by atan2(sin, cos); its conjugate comes first.
+    half = 0.5 * torch.atan2(view.heading.sin, view.heading.cos)
+    zero = torch.zeros_like(half)
+    turn = torch.stack((half.cos(), zero, zero, -half.sin()), dim=-1)
+    attitude = quaternion.multiply(turn, physics.object_quat)
+    attitude = torch.where(attitude[..., :1] < 0, -attitude, attitude)
+    return {
+        "javelin_pos": pos,
+        "javelin_quat": attitude,
+        "javelin_linvel": linvel,
+        "javelin_angvel": angvel,
+        "hand": hand,
+        "root": way,
+    }
+
+
+def advance(view: View, memory: Memory) -> Advance:
+    """One control step by the rules of the sport."""
+    physics, root, clock = view.physics, view.root_pos[:, 0], view.clock
+    grip, velocity, hand = physics.object_pos[:, 0], physics.object_linvel[:, 0], _palm(view)
+    ends, speeds = _ends(view)
+    nose = (ends[:, 0] - ends[:, 1]) / (2 * END)
+
+    held, late = clock < HOLD_STEPS, clock >= THROW_STEPS
+    aim = torch.where(late[:, None], _unit(velocity), constant(AIM, root.device))
+    angle = torch.acos((nose * aim).sum(-1).clamp(-1.0, 1.0))
+    to_hand = hand - grip
+    apart = squared(to_hand)
+    near = torch.exp(-torch.stack((apart, squared(root - memory["start"]))))
+    x = grip[:, 0]
+    shares = torch.stack((near[0], near[1], x - memory["x"], torch.exp(-angle.square())), dim=-1)
+    weights = constant(_WEIGHTS, root.device).view(3, 4)
+    names = ("grab", "start", "goal", "attitude")
+    stage = (clock >= HOLD_STEPS).long() + late
+    terms = dict(zip(names, (weights[stage] * shares).unbind(-1)))
+
+    # The hand leaves the shaft.
+    touched, landed = (physics.pair_force > 0).unbind(-1)
+    along = (to_hand * nose).sum(-1).clamp(-END, END)
+    away = squared(torch.addcmul(to_hand, along[:, None], nose, value=-1)) > REACH**2
+    free = away & ~touched
+    released = memory["released"] | free
+    lost = held & ((apart > REACH**2) | (angle > MAX_TILT))
+    clinging = (clock >= RELEASE_STEPS) & ~free
+
+    furthest = view.geometry.marks(physics.body_pos[:, 0], view.rotation[:, 0], TOUCH).furthest
+    touches_beyond = view.touching()[:, 0] & (physics.body_pos[:, 0, :, 0] >= LINE_X)
+    outside = (root[:, :2].abs() > HALF_FIELD).any(-1)
+    foul = outside | (furthest >= LINE_X) | touches_beyond.any(-1)
+    fell = view.fallen()[:, 0] & ~released
+    failed = lost | clinging | foul | fell
+
+    mark, nose_first = _landing(memory["ends"], memory["speeds"], view.control_timestep)
+    distance = mark - LINE_X
+    # What the hand still held when it came down was no throw: the release was seen before.
+    success = landed & memory["released"] & ~failed & (distance > 0)
+    speed = torch.where(memory["released"], memory["release_speed"], length(velocity))
+    metrics = nan_where(~success, torch.stack((distance, nose_first.float(), speed)))
+    metrics = dict(zip(("distance", "tip_first", "release_speed"), metrics))
+    metrics |= {"success": success.float(), "foul": foul.float()}
+    memory = {
+        "start": memory["start"],
+        "x": x.clone(),
+        "ends": ends,
+        "speeds": speeds,
+        "released": released,
+        "release_speed": nan_where(~released, speed),
+    }
+    return Advance(
+        memory=memory,
+        terms={name: term[:, None] for name, term in terms.items()},
+        terminated=(failed | landed)[:, None],
+        metrics=metrics,
+        success=success,
+    )
+
+
+def _palm(view: View) -> Tensor:
+    """(N, 3) the middle of the right palm."""
+    physics = view.physics
+    wrist = physics.scene.body.link_index("R_Wrist")
+    palm = constant(PALM, physics.body_pos.device)
+    return physics.body_pos[:, 0, wrist] + view.rotation[:, 0, wrist] @ palm
+
+
+def _ends(view: View) -> tuple[Tensor, Tensor]:
+    """(N, 2, 3) the round ends' middles, nose and tail, and their velocities."""
+    physics = view.physics
+    quat = physics.object_quat[:, 0]
+    arm = END * quaternion.rotate(quat, constant((1.0, 0.0, 0.0), quat.device))
+    swing = torch.linalg.cross(physics.object_angvel[:, 0], arm)
+    arms, swings = torch.stack((arm, -arm), dim=1), torch.stack((swing, -swing), dim=1)
+    return physics.object_pos + arms, physics.object_linvel + swings
+
+
+def _landing(ends: Tensor, speeds: Tensor, timestep: float) -> tuple[Tensor, Tensor]:
+    """(N,) x where the javelin meets the ground within a control step that began so, and whether
+    the nose comes first. The ends (N, 2, 3) fly on their parabolas: at 25 m/s a control step is
+    0.8 m long, and where the javelin is after it has bounced or slid says little."""
+    x, _, z = ends.unbind(-1)
+    forward, _, up = speeds.unbind(-1)
+    drop = (z - JAVELIN_RADIUS).clamp(min=0.0)
+    time = (up + (up.square() + 2 * GRAVITY * drop).sqrt()) / GRAVITY
+    first = time.min(dim=1, keepdim=True)
+    met = torch.addcmul(x, forward, time.clamp(max=timestep))
+    return met.gather(1, first.indices)[:, 0], first.indices[:, 0] == 0
+
+
+def _unit(v: Tensor) -> Tensor:
+    """(N, 3) directions; 0 where there is none."""
+    return v / length(v).clamp(min=1e-6)[:, None]
+
+
+TASK = Task(
+    name="javelin",
+    config=Javelin,
+    scene=scene,
+    start=start,
+    begin=begin,
+    features=features,
+    advance=advance,
+    metrics={
+        "success": "fraction",
+        "distance": "m",
+        "tip_first": "fraction",
+        "release_speed": "m/s",
+        "foul": "fraction",
+    },
+    main_metric="distance",
+    max_steps=300,
+    body="smplx",
+    age_at_start=False,
+    summary="Throw a javelin from behind the line.",
+)
