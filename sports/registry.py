@@ -5,19 +5,26 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from sports import boxing, fencing, high_jump, hurdling, long_jump
+from sports import (
+    boxing,
+    fencing,
+    high_jump,
+    hurdling,
+    javelin,
+    long_jump,
+)
 from sports.humanoid.body import load_body
 from sports.task import Task
 
-_TASKS: dict[str, Task] = {
-    t.name: t for t in (high_jump.TASK, long_jump.TASK, hurdling.TASK, fencing.TASK, boxing.TASK)
-}
-from sports import high_jump, hurdling, javelin, long_jump
-from sports.humanoid.body import load_body
-from sports.task import Task
-
-_ALL = (high_jump.TASK, long_jump.TASK, hurdling.TASK, javelin.TASK)
-_TASKS: dict[str, Task] = {t.name: t for t in _ALL}
+_ALL = (
+    high_jump.TASK,
+    long_jump.TASK,
+    hurdling.TASK,
+    javelin.TASK,
+    fencing.TASK,
+    boxing.TASK,
+)
+_TASKS: dict[str, Task] = {task.name: task for task in _ALL}
 
 
 def task_names() -> tuple[str, ...]:

@@ -60,6 +60,9 @@ class SceneObject:
     drag: tuple[float, float] | None = None
     """Quadratic drag of a free object through the air (N s^2/m^2): along its x axis and across
     it. The force on its centre of mass is ``-k |v| v`` of either part of its velocity."""
+    holdable: bool = False
+    """Whether hands can hold it: its contacts with athletes are then firm (``mjcf.HOLD_SOLREF``),
+    whatever ``solref`` says; in MuJoCo's usual ones friction creeps by centimetres a second."""
 
     def __post_init__(self) -> None:
         if (self.motion == "ball") != (self.law is not None):
@@ -104,9 +107,6 @@ class Surface:
             raise ValueError(f"surface '{self.name}': a {self.kind} cannot have size {self.size}")
         if self.kind == "waves" and (self.link is not None or self.quat != (1.0, 0.0, 0.0, 0.0)):
             raise ValueError(f"surface '{self.name}': waves lie flat in the world")
-    holdable: bool = False
-    """Whether hands can hold it: its contacts with athletes are then firm (``mjcf.HOLD_SOLREF``),
-    whatever ``solref`` says; in MuJoCo's usual ones friction creeps by centimetres a second."""
 
 
 @dataclass(frozen=True)

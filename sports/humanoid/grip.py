@@ -254,7 +254,9 @@ def close(rig: Rig, qpos: np.ndarray, thumb: float) -> np.ndarray:
     return data.qpos.copy()
 
 
-def statics(rig: Rig, qpos: np.ndarray, forces: list[tuple[int, np.ndarray, np.ndarray]]) -> np.ndarray:
+def statics(
+    rig: Rig, qpos: np.ndarray, forces: list[tuple[int, np.ndarray, np.ndarray]]
+) -> np.ndarray:
     """(num_dofs,) torques that keep the pose with the feet on the ground and ``forces`` on links:
     (number, place (3,), force (3,)). Raises ValueError where the athlete would topple."""
     model, data, n = rig.model, rig.data, rig.n
@@ -479,9 +481,13 @@ def main() -> None:
     parser.add_argument("name", choices=sorted(SEARCHES))
     parser.add_argument("--trials", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=None, help="data file; the package's by default")
+    parser.add_argument(
+        "--out", type=Path, default=None, help="data file; the package's by default"
+    )
     args = parser.parse_args()
-    command = f"python -m sports.humanoid.grip {args.name} --trials {args.trials} --seed {args.seed}"
+    command = (
+        f"python -m sports.humanoid.grip {args.name} --trials {args.trials} --seed {args.seed}"
+    )
     hold, drawn, _ = search(args.name, args.trials, args.seed)
     write(hold, drawn, command, args.out or DATA / f"hold_{args.name}.json")
     for strength in ("paper", "human"):

@@ -49,7 +49,6 @@ from sports.humanoid.drake_plant import (
 from sports.humanoid.mjcf import build_model
 from sports.physics.base import Geometry, PhysicsState, diverged
 from sports.physics.game import build_game, has_game
-from sports.scene import Scene, SceneObject
 from sports.scene import GROUND, Scene, SceneObject
 
 MAX_TIMESTEP = 1.0 / 480.0

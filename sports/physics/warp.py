@@ -16,7 +16,6 @@ import warp as wp
 from torch import Tensor
 
 from sports.ball_law.compiled import for_gpu
-from sports.humanoid.mjcf import GROUND, body_name, build_model
 from sports.humanoid.mjcf import body_name, build_model
 from sports.physics.base import GRAVITY, NO_FORCE, Geometry, PhysicsState, diverged
 from sports.physics.game import build_game, has_game
