@@ -5,11 +5,21 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from sports import high_jump, long_jump
+from sports import high_jump, long_jump, table_tennis, tennis
 from sports.humanoid.body import load_body
 from sports.task import Task
 
-_TASKS: dict[str, Task] = {t.name: t for t in (high_jump.TASK, long_jump.TASK)}
+_TASKS: dict[str, Task] = {
+    t.name: t
+    for t in (
+        high_jump.TASK,
+        long_jump.TASK,
+        tennis.TASK,
+        tennis.DUEL,
+        table_tennis.TASK,
+        table_tennis.DUEL,
+    )
+}
 
 
 def task_names() -> tuple[str, ...]:
