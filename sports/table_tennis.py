@@ -111,7 +111,7 @@ def scene(config: TableTennis, body: Body, agents: int = 1) -> Scene:
         name="table_tennis" if agents == 1 else "table_tennis_1v1",
         body=body,
         agents=rackets.players(GAME, agents),
-        objects=(board, net, rackets.ball(GAME)),
+        objects=(rackets.ball(GAME), board, net),
         surfaces=(
             Surface("table", "box", center=board.pos, size=board.shapes[0].size),
             Surface("ground", "plane"),

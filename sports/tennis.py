@@ -130,7 +130,7 @@ def scene(config: Tennis, body: Body, agents: int = 1) -> Scene:
         name="tennis" if agents == 1 else "tennis_1v1",
         body=body,
         agents=rackets.players(rules, agents),
-        objects=(*nets, rackets.ball(rules)),
+        objects=(rackets.ball(rules), *nets),
         surfaces=(
             Surface("ground", "plane"),
             *(rackets.solid(part, restitution=NET_RESTITUTION) for part in nets),

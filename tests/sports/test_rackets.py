@@ -3,11 +3,16 @@ on the engines."""
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
 from sports import table_tennis, tennis
-from tests.sports.rackets_made import HandMadeRally, made
+from sports.ball import landing
+from sports.env import Env, make_env
+from sports.physics import default_state
+from tests.sports.rackets_made import HandMadeRally
 
 GAMES = {"tennis": tennis.GAME, "table_tennis": table_tennis.GAME}
 TASKS = ("tennis", "tennis_1v1", "table_tennis", "table_tennis_1v1")
@@ -176,3 +181,120 @@ def test_a_permutation_of_the_worlds_permutes_everything(task):
             assert torch.equal(a.move.qvel[order], b.move.qvel)
             again += int(a.move.mask.sum())
     assert again > 0 or task.endswith("1v1")
+
+
+# On the engines: a ball that meets a racket held still in its way.
+
+SHOTS = {
+    # Place of the athlete, tilt of the racket (rad), speed of the ball (m/s).
+    "tennis": ((4.0, 0.0), math.radians(75.0), 18.0),
+    "table_tennis": ((2.0, -0.5), math.radians(80.0), 9.0),
+}
+
+
+def block(task: str, engine: str = "mujoco", **options) -> tuple[Env, torch.Tensor]:
+    """An athlete with the right arm stretched out and a ball flying at the racket; the action that
+    holds the pose."""
+    sport = task.removesuffix("_1v1")
+    place, tilt, speed = SHOTS[sport]
+    env = make_env(task, engine=engine, num_worlds=1, training=False, physics_options=options)
+    physics = env.physics
+    scene, body = physics.scene, physics.scene.body
+    wrist = body.dof_index("R_Wrist_y")
+    state = default_state(scene, 1, "cpu")
+    state.qpos[:, :2] = torch.tensor(place)
+    state.qpos[:, 7 + wrist] = tilt
+    q, v = scene.object_qpos("ball"), scene.object_qvel("ball")
+    racket = torch.tensor((place[0] + 0.07, place[1] + 0.683 + GAMES[sport].reach, 1.384))
+    state.qpos[:, q.start : q.start + 3] = racket - torch.tensor((speed / 15, 0.0, 0.0))
+    state.qvel[:, v.start : v.start + 3] = torch.tensor((speed, 0.0, 0.3))
+    physics.reset(torch.tensor([True]), state)
+    env.view.refresh()
+    luck = torch.rand(1, 16, 9, generator=torch.Generator().manual_seed(1))
+    env.memory = env.task.begin(env.view, {"luck": luck})
+    env.memory["bounced"][:] = True
+    action = torch.zeros(1, env.num_agents, env.action_size)
+    action[0, 0, wrist] = tilt / math.pi
+    return env, action
+
+
+@pytest.mark.parametrize("sport", ["tennis", "table_tennis"])
+def test_a_block_is_a_return_and_the_machine_plays_on(sport):
+    env, action = block(sport, threads=1)
+    physics, game = env.physics, GAMES[sport]
+    spots, bounced_at, again = [], None, None
+    for _ in range(90):
+        step = env.step(action)
+        assert not step.terminated.any()
+        if step.terms["landing"][0, 0] > 0:
+            assert step.terms["landing"][0, 0] >= 1.0 and step.terms["approach"][0, 0] == 0.0
+            flight = [physics.object_pos, physics.object_linvel, physics.object_angvel]
+            height = game.court.height + game.radius
+            spots.append(landing(game.law, *(x[:, 0] for x in flight), height)[0][0])
+        if physics.ball_hits[0, 0] and bounced_at is None:
+            bounced_at = physics.ball_hit_pos[0, 0].clone()
+            assert step.metrics["hits"][0] == 1.0
+        if env.memory["balls"][0] == 2:
+            again = physics.object_pos[0, 0].clone()
+            break
+    assert bounced_at is not None and len(spots) > 15
+    for spot in spots:  # what the reward looked ahead to is what came
+        assert torch.allclose(spot, bounced_at, atol=0.01)
+    assert again is not None and again[0] == game.serve.x
+    # The next ball comes down where the machine aimed.
+    q, bounces = physics.scene.object_qpos("ball"), 0
+    for _ in range(60):
+        step = env.step(action)
+        if physics.ball_hits[0, 0]:
+            bounces += 1
+            spot = physics.ball_hit_pos[0, 0]
+            (near, far), (right, left) = game.serve.land_x, game.serve.land_y
+            assert near - 0.01 < spot[0] < far + 0.01 and right - 0.01 < spot[1] < left + 0.01
+            break
+    assert bounces == 1 and q.start > 0
+
+
+@pytest.mark.parametrize("sport", ["tennis", "table_tennis"])
+def test_a_ball_that_rests_on_the_racket_is_lost(sport):
+    """Dropped on a level racket: it bounces up, legally so far, and comes down on it again."""
+    env, action = block(sport, threads=1)
+    physics, scene = env.physics, env.physics.scene
+    state = default_state(scene, 1, "cpu")
+    state.qpos[:, 0] = 5.0
+    q = scene.object_qpos("ball")
+    reach = GAMES[sport].reach
+    state.qpos[0, q.start : q.start + 3] = torch.tensor((5.075, 0.683 + reach, 1.384 + 0.15))
+    if sport == "table_tennis":  # beside the table's end, so that nothing else is in the way
+        state.qpos[0, 0], state.qpos[0, q.start] = 2.5, 2.575
+    physics.reset(torch.tensor([True]), state)
+    env.view.refresh()
+    env.memory["ball"] = physics.object_pos[:, 0].clone()
+    contacts, paid = 0, 0.0
+    for _ in range(40):
+        step = env.step(torch.zeros_like(action))
+        paid += float(step.terms["landing"].sum())
+        contacts += 1
+        if step.terminated[0, 0]:
+            break
+    assert step.terminated[0, 0] and step.metrics["contacts"][0] == 1.0
+    assert 5 < contacts < 30 and paid == 0.0 and step.metrics["hits"][0] == 0.0
+
+
+@pytest.mark.parametrize("task", ["tennis", "table_tennis_1v1"])
+def test_both_mujocos_play_the_same_second(task):
+    """A stroke and what follows: impacts, rewards and the ball's place after 30 steps."""
+    pytest.importorskip("mujoco_warp")
+    runs = []
+    for engine, options in (("mujoco", {"threads": 1}), ("warp", {"device": "cpu"})):
+        env, action = block(task, engine, **options)
+        rewards, hits = [], []
+        for _ in range(30):
+            step = env.step(action)
+            rewards.append(step.reward[0].clone())
+            hits.append(env.physics.ball_hits[0].clone())
+        runs.append((torch.stack(rewards), torch.stack(hits), env.physics.object_pos[0, 0].clone()))
+        env.close()
+    (reward, hits, ball), (other_reward, other_hits, other_ball) = runs
+    assert torch.equal(hits, other_hits) and hits[:, -env.num_agents].sum() >= 1
+    assert torch.allclose(reward, other_reward, atol=2e-3) and reward.max() >= 1.0
+    assert torch.allclose(ball, other_ball, atol=5e-3)
