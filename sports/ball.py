@@ -141,6 +141,23 @@ def landing(
     return where, when
 
 
+def crossing(
+    law: str | BallLaw,
+    pos: Tensor,
+    linvel: Tensor,
+    angvel: Tensor,
+    x: float,
+    limit: float = TIME_LIMIT,
+) -> tuple[Tensor, Tensor]:
+    """Where (N, 3) and after how many seconds (N,) balls in free flight first come to the plane
+    at ``x``: over a net. A ball that does not within ``limit`` (s): where it is then, and inf."""
+    n = len(pos)
+    where, when = pos.new_empty(n, 3), pos.new_empty(n)
+    arguments = (pos, linvel, angvel, float(x), float(limit))
+    _run("meet_worlds", n, law, arguments, (where, when))
+    return where, when
+
+
 def path(
     law: str | BallLaw,
     pos: Tensor,

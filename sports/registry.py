@@ -12,6 +12,8 @@ from sports import (
     hurdling,
     javelin,
     long_jump,
+    table_tennis,
+    tennis,
 )
 from sports.humanoid.body import load_body
 from sports.task import Task
@@ -21,6 +23,10 @@ _ALL = (
     long_jump.TASK,
     hurdling.TASK,
     javelin.TASK,
+    tennis.TASK,
+    tennis.DUEL,
+    table_tennis.TASK,
+    table_tennis.DUEL,
     fencing.TASK,
     boxing.TASK,
 )

@@ -70,6 +70,34 @@ def land(
     return q, time
 
 
+def meet(
+    p: Vector, v: Vector, spin: Vector, x: float, limit: float, ball: Row
+) -> tuple[Vector, float]:
+    """Where and when (s) a ball first comes to a plane across the x axis; where it is at the time
+    limit, and ``NEVER``, where it does not."""
+    q, u = add(p, vec(0.0, 0.0, 0.0)), add(v, vec(0.0, 0.0, 0.0))
+    time, found = float(0.0), int(0)
+    for _ in range(int(limit / STRIDE) + 2):
+        h = float(min(STRIDE, limit - time))
+        if h <= 0.0:
+            break
+        r, s = fly(q, u, spin, h, ball)
+        if (q[0] - x) * (r[0] - x) <= 0.0 and q[0] != r[0]:
+            found = 1
+            h = h * (x - q[0]) / (r[0] - q[0])
+            for _ in range(REFINEMENTS):
+                r, s = fly(q, u, spin, h, ball)
+                h = h - (r[0] - x) / s[0]
+            r, s = fly(q, u, spin, h, ball)
+        q, u = r, s
+        time = time + h
+        if found == 1:
+            break
+    if found == 0:
+        time = float(NEVER)
+    return q, time
+
+
 def follow(
     p: Vector, v: Vector, spin: Vector, h: float, floor: float, ground: Vector, ball: Row
 ) -> tuple[Vector, Vector, Vector]:
@@ -211,6 +239,23 @@ def land_world(
     time[i] = when
 
 
+def meet_world(
+    i: int,
+    p: Matrix,
+    v: Matrix,
+    spin: Matrix,
+    x: float,
+    limit: float,
+    ball: Row,
+    pos: Matrix,
+    time: Row,
+) -> None:
+    """``meet`` of world ``i``, written to ``pos`` and ``time``."""
+    where, when = meet(read(p, i), read(v, i), read(spin, i), x, limit, ball)
+    put(pos, i, where)
+    time[i] = when
+
+
 def path_world(
     i: int,
     p: Matrix,
@@ -265,6 +310,21 @@ def land_worlds(
     """``land_world`` of all worlds, on a CPU."""
     for i in range(len(p)):
         land_world(i, p, v, spin, height, limit, ball, pos, time)
+
+
+def meet_worlds(
+    p: Matrix,
+    v: Matrix,
+    spin: Matrix,
+    x: float,
+    limit: float,
+    ball: Row,
+    pos: Matrix,
+    time: Row,
+) -> None:
+    """``meet_world`` of all worlds, on a CPU."""
+    for i in range(len(p)):
+        meet_world(i, p, v, spin, x, limit, ball, pos, time)
 
 
 def path_worlds(
