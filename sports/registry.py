@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from sports import high_jump, long_jump
+from sports import golf, high_jump, long_jump
 from sports.humanoid.body import load_body
 from sports.task import Task
 
-_TASKS: dict[str, Task] = {t.name: t for t in (high_jump.TASK, long_jump.TASK)}
+_TASKS: dict[str, Task] = {t.name: t for t in (high_jump.TASK, long_jump.TASK, golf.TASK)}
 
 
 def task_names() -> tuple[str, ...]:

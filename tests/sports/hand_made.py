@@ -20,8 +20,8 @@ class HandMade:
             physics_options={"threads": 1},
         )
         self.state: PhysicsState = default_state(self.env.physics.scene, num_worlds, "cpu")
-        # The task's own start decides bars and targets.
-        self.state, _ = self.env.task.start(
+        # The task's own start decides bars, hurdles and targets.
+        self.state, self.context = self.env.task.start(
             self.env.view, self.state, {}, self.env.generator, False
         )
 
@@ -50,11 +50,7 @@ class HandMade:
     def begin(self) -> None:
         """Starts an episode in the placed state."""
         self._apply()
-        context = {}
-        if hasattr(self.env.config, "bar_height"):
-            context["bar_height"] = torch.full((self.env.num_worlds,), self.env.config.bar_height)
-            context["standing"] = torch.ones(self.env.num_worlds, dtype=torch.bool)
-        self.env.memory = self.env.task.begin(self.env.view, context)
+        self.env.memory = self.env.task.begin(self.env.view, self.context)
         self.env.view.clock = torch.full((self.env.num_worlds,), 5)
 
     def advance(
