@@ -58,6 +58,9 @@ GRID, GRID_LENGTH, GRID_HALF_WIDTH = 32, 20.0, 10.0
 """Heights that are seen: 32 x 32 points, x in [0, 20], y in [-10, 10] (m)."""
 PATIENCE = 2.0
 """Seconds in which the head must meet the ball."""
+STROKE_TIME = 1 / 30
+"""Seconds in which impacts on the club are one contact: a ball that is squeezed between head and
+tee meets either several times in a few milliseconds."""
 BACKWARDS = 0.05
 """The ball may go this far (m) behind the tee before it lands."""
 KICK = 0.15
@@ -169,8 +172,10 @@ def start(
     distance = closest + (FURTHEST - closest) * draw[:, 0]
     if config.distance is not None:
         distance = torch.full_like(distance, config.distance)
-    state.wave_phase = 2 * math.pi * draw[:, 1:]
-    return state, {"distance": distance, "phases": state.wave_phase}
+    phases = 2 * math.pi * draw[:, 1:]
+    if config.terrain == "waves":
+        state.wave_phase = phases
+    return state, {"distance": distance, "phases": phases}
 
 
 def begin(view: View, context: Memory) -> Memory:
@@ -187,7 +192,7 @@ def begin(view: View, context: Memory) -> Memory:
         "phases": phases,
         "waves": waves,
         "ball": ball.clone(),
-        "contacts": zero.clone(),
+        "met_at": torch.full_like(zero, torch.inf),
         "landed": zero.bool(),
         "landing": ball.clone(),
         "still": zero.clone(),
@@ -220,20 +225,25 @@ def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
     config: Golf = view.config
     physics = view.physics
-    hits, target = physics.ball_hits, memory["target"]
+    target = memory["target"]
     ball, linvel = physics.object_pos[:, 0], physics.object_linvel[:, 0]
 
     # Contact, and a second one.
-    contacts = memory["contacts"] + hits[:, HEAD]
-    contact = contacts > 0
-    first = contact & (memory["contacts"] == 0)
-    pushed = (contacts > 1) | (hits[:, SHAFT] > 0)
+    began = (view.clock - 1) * view.control_timestep
+    on_head, on_shaft = physics.ball_hit_time[:, HEAD], physics.ball_hit_time[:, SHAFT]
+    met_before = memory["met_at"]
+    met_at = torch.minimum(met_before, began + on_head)
+    contact = met_at < torch.inf
+    first = contact & (met_before == torch.inf)
+    on_club = torch.minimum(on_head, on_shaft)
+    again = (on_club < torch.inf) & (began + on_club > met_before + STROKE_TIME)
+    shaft_first = (on_shaft < on_head) & (met_before == torch.inf)
     to_head = squared(ball - head_pos(view))
     before = memory["nearest"]
     nearest = torch.where(contact, before, torch.minimum(before, to_head.sqrt()))
 
     # Flight, landing and rest.
-    lands = contact & ~memory["landed"] & (hits[:, TURF] > 0)
+    lands = contact & ~memory["landed"] & (physics.ball_hits[:, TURF] > 0)
     where = physics.ball_hit_pos[:, TURF]
     waves = WAVES if config.terrain == "waves" else (0.0, *WAVES[1:])
     spin, phases = physics.object_angvel[:, 0], memory["phases"]
@@ -251,7 +261,7 @@ def advance(view: View, memory: Memory) -> Advance:
     aside = squared(physics.body_pos[:, 0] - ball[:, None])
     others = constant(_kick_distances(physics.scene.body.link_names), ball.device)
     kicked = (aside < others).any(-1)
-    foul = pushed | backwards | kicked
+    foul = again | shaft_first | backwards | kicked
     late = view.clock >= round(PATIENCE / view.control_timestep)
     missed = ~contact & (late | view.fallen()[:, 0])
     hit = contact & ~foul
@@ -287,7 +297,7 @@ def advance(view: View, memory: Memory) -> Advance:
         memory=memory
         | {
             "ball": ball.clone(),
-            "contacts": contacts,
+            "met_at": met_at,
             "landed": landed,
             "landing": landing,
             "still": still,

@@ -21,7 +21,7 @@ class Stroke(HandMade):
     def __init__(self, num_worlds: int = 1, **options: object) -> None:
         options = {"terrain": "flat", "distance": 10.0} | options
         super().__init__("golf", num_worlds, **options)
-        self.hits: dict[int, int] = {}
+        self.hits: dict[int, float] = {}
         self.hit_at = (0.0, 0.0, 0.0)
 
     def ball(self, pos: tuple[float, float, float], linvel=(0.0, 0.0, 0.0)) -> None:
@@ -32,13 +32,16 @@ class Stroke(HandMade):
     def _apply(self) -> None:
         super()._apply()
         physics = self.env.physics
-        for surface, number in self.hits.items():
-            physics.ball_hits[:, surface] = number
+        for surface, time in self.hits.items():
+            physics.ball_hits[:, surface] = 1
+            physics.ball_hit_time[:, surface] = time
             physics.ball_hit_pos[:, surface] = torch.tensor(self.hit_at)
 
     def step(self, hits=(), at=(0.0, 0.0, 0.0), forces=None):
-        """A control step in which the ball met these surfaces, at one place."""
-        self.hits, self.hit_at = dict.fromkeys(hits, 1), at
+        """A control step in which the ball met these surfaces, at one place: 0.01 s after it began
+        or when a dict says."""
+        self.hits = dict(hits) if isinstance(hits, dict) else dict.fromkeys(hits, 0.01)
+        self.hit_at = at
         step = self.advance(forces)
         self.hits = {}
         return step
@@ -252,7 +255,6 @@ def test_a_ball_that_bounces_on_its_tee_has_not_landed():
     stroke.ball((0.0, 0.0, 0.08), (0.0, 0.0, 0.3))
     assert not stroke.step([HEAD, TEE]).terminated[0, 0]
     assert not stroke.env.memory["landed"][0]
-    assert stroke.env.memory["contacts"][0] == 1
 
 
 def test_the_ball_must_be_met_within_two_seconds():
@@ -269,29 +271,41 @@ def test_the_ball_must_be_met_within_two_seconds():
     assert not stroke.step().terminated[0, 0]
 
 
-@pytest.mark.parametrize(("hits", "foul"), [([HEAD], True), ([SHAFT], True), ([TURF], False)])
-def test_a_second_contact_of_the_club_is_a_foul(hits: list[int], foul: bool):
-    stroke = struck()
-    stroke.ball((1.0, 0.0, 0.4), (12.0, 0.0, 4.0))
-    step = stroke.step(hits, at=(0.9, 0.0, 0.02135))
-    assert bool(step.terminated[0, 0]) is foul
-    assert bool(step.success[0]) is not foul and not step.remaining_paid[0]
-    assert step.metrics["hit_rate"][0] == 1 - foul and step.metrics["contact"][0] == 1
-    assert bool(step.metrics["error"][0].isnan()) is foul
+@pytest.mark.parametrize(("surface", "foul"), [(HEAD, True), (SHAFT, True), (TURF, False)])
+def test_a_second_contact_of_the_club_is_a_foul(surface: int, foul: bool):
+    """The first one was 0.01 s after its step began; a step is 1/30 s."""
+    for later, too_late in ((0.0099, False), (0.0101, foul)):
+        stroke = struck()
+        stroke.ball((1.0, 0.0, 0.4), (12.0, 0.0, 4.0))
+        step = stroke.step({surface: later}, at=(0.9, 0.0, 0.02135))
+        assert bool(step.terminated[0, 0]) is too_late
+        assert bool(step.success[0]) is not too_late and not step.remaining_paid[0]
+        assert step.metrics["hit_rate"][0] == 1 - too_late and step.metrics["contact"][0] == 1
+        assert bool(step.metrics["error"][0].isnan()) is too_late
 
 
-def test_two_contacts_in_one_step_are_two():
+def test_a_ball_squeezed_on_its_tee_is_met_once():
+    """5 ms, across the end of a control step."""
     stroke = addressed()
     stroke.ball((0.1, 0.0, 0.1), (3.0, 0.0, 1.0))
-    stroke.hits = {HEAD: 2}
-    assert stroke.advance().terminated[0, 0]
+    step = stroke.step({HEAD: 0.03, TEE: 0.031})
+    assert not step.terminated[0, 0] and step.success[0]
+    step = stroke.step({HEAD: 0.002, TEE: 0.001})
+    assert not step.terminated[0, 0] and step.success[0]
 
 
 def test_the_shaft_is_no_head():
-    stroke = addressed()
-    stroke.ball((0.1, 0.0, 0.1), (3.0, 0.0, 1.0))
-    step = stroke.step([SHAFT])
-    assert step.terminated[0, 0] and not step.success[0] and step.metrics["contact"][0] == 0
+    """Alone or first; a ball that comes off the head on the shaft was struck with the head."""
+    for hits, foul in (
+        ({SHAFT: 0.02}, True),
+        ({SHAFT: 0.019, HEAD: 0.02}, True),
+        ({SHAFT: 0.021, HEAD: 0.02}, False),
+    ):
+        stroke = addressed()
+        stroke.ball((0.1, 0.0, 0.1), (3.0, 0.0, 1.0))
+        step = stroke.step(hits)
+        assert bool(step.terminated[0, 0]) is foul and bool(step.success[0]) is not foul
+        assert step.metrics["contact"][0] == (HEAD in hits)
 
 
 @pytest.mark.parametrize(("link", "kick"), [("L_Toe", True), ("R_Hand", False), ("Head", True)])
