@@ -217,7 +217,7 @@ def features(view: View, memory: Memory) -> dict[str, Tensor]:
     points = torch.stack((view.physics.object_pos[:, 0], head_pos(view), memory["target"]), 1)
     ball, head, target = view.heading.local(points[:, None] - view.root_pos[:, :, None]).unbind(2)
     along, across = memory["waves"].unbind(1)
-    heights = (along[:, :, None] + across[:, None]) * _grid(points.device)[1]
+    heights = (along[:, :, None] + across[:, None]).mul_(_grid(points.device)[1])
     return {"ball": ball, "head": head, "target": target, "heights": heights.flatten(1)[:, None]}
 
 

@@ -2,12 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from sports.env import make_env
+from sports.env import Env, make_env
 from sports.golf import HEAD, SHAFT, TEE, TURF, head_pos, turf_height
 from sports.humanoid import load_body
+from sports.physics import PhysicsState
 from tests.sports.hand_made import HandMade
 
 STANDING = 0.9417
@@ -371,3 +373,137 @@ def test_options_are_checked():
     ):
         with pytest.raises(ValueError, match=words):
             make_env("golf", num_worlds=1, options=options)
+
+
+# Strokes in the engine.
+
+SWINGS = ((0.79, -1.34, 0.47, 2.88), (0.82, -1.35, 0.81, 3.01), (0.94, -0.57, 0.77, 2.64))
+"""Tilt of the plane of the swing (rad), turn of the club about itself on the way down (rad),
+seconds, angle of the swing (rad); found by a random search for legal hits that go far, go less far,
+stay on the ground. The T-pose is the top of the backswing."""
+
+
+def turn(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation matrix (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array(((0, -z, y), (z, 0, -x), (-y, x, 0)))
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def swing(env: Env, seconds: float, swings=SWINGS) -> torch.Tensor:
+    """(N, 1, 69) actions of the right shoulder alone, each world by one of the swings in turn."""
+    action = torch.zeros(env.num_worlds, 1, env.action_size)
+    body = env.physics.scene.body
+    shoulder = [body.dof_index(f"R_Shoulder_{axis}") for axis in "xyz"]
+    for world in range(env.num_worlds):
+        tilt, twist, duration, angle = swings[world % len(swings)]
+        done = min(seconds / duration, 1.0)
+        plane = turn(np.array((math.sin(tilt), 0.0, math.cos(tilt))), angle * done)
+        r = plane @ turn(np.array((0.0, 1.0, 0.0)), twist * min(2 * done, 1.0))
+        # Intrinsic x, y, z.
+        angles = math.atan2(-r[1, 2], r[2, 2]), math.asin(r[0, 2]), math.atan2(-r[0, 1], r[0, 0])
+        action[world, 0, shoulder] = torch.tensor(angles) / math.pi
+    return action
+
+
+@pytest.mark.parametrize("terrain", ["flat", "waves"])
+def test_a_swing_sends_the_ball_off_and_it_comes_to_rest(terrain: str):
+    """Until the club comes it lies on its tee to the last bit; it lands where the law said when it
+    was hit; it comes to rest on the turf, which ends the episode and is paid on."""
+    n = 2 * len(SWINGS)
+    options = {"terrain": terrain, "distance": 10.0}
+    env = make_env("golf", num_worlds=n, training=False, seed=4, options=options)
+    env.keep_snapshot = True
+    place = env.physics.scene.object_qpos("ball")
+    phases, target = env.memory["phases"], env.memory["target"]
+    over, off, path = torch.zeros(n, dtype=torch.bool), [], []
+    for k in range(env.max_steps):
+        before = env.memory
+        step = env.step(swing(env, (k + 1) / 30))
+        ball = env.final_snapshot["qpos"][:, place][:, :3]
+        path.append(ball)
+        waits = ~over & (step.metrics["contact"] == 0)
+        assert (ball[waits] == torch.tensor(ON_TEE)).all()
+        flew = ~over & before["met_at"].isfinite() & ~before["landed"] & env.memory["landed"]
+        off += (before["landing"] - env.memory["landing"]).norm(dim=1)[flew].tolist()
+        ends = ~over & step.ended
+        assert (step.metrics["success"][ends] == 1).all() and step.terminated[ends].all()
+        assert (step.remaining_paid[ends] == env.max_steps - (k + 1)).all()
+        error = (ball - target).norm(dim=1)
+        torch.testing.assert_close(step.metrics["error"][ends], error[ends])
+        # The ball touches the turf: as far from it as it is thick, along the normal.
+        height = turf_height(ball[:, 0], ball[:, 1], phases) if terrain == "waves" else 0 * error
+        above = (ball[:, 2] - height)[ends]
+        assert (above > 0.0213).all() and (above < 0.0225).all()
+        assert (ball[ends, 0] > 2.0).all() and (step.metrics["carry"][ends] > 0.3).all()
+        assert ((path[-1] - path[max(-3, -len(path))])[ends].abs() < 1e-3).all()
+        over |= ends
+        if over.all():
+            break
+    print(f"{terrain}: at rest after {k + 1} steps; landings predicted to {max(off):.1e} m")
+    assert over.all() and len(off) == n and max(off) < 0.005
+    env.close()
+
+
+def test_a_ball_at_rest_on_a_slope_stays():
+    """On the steepest places of 40 different waves, for 2 s."""
+    n = 40
+    env = make_env("golf", num_worlds=n, training=False, seed=2)
+    along = torch.linspace(-10, 10, 81)
+    x, y = (v.flatten().expand(n, -1) for v in torch.meshgrid(along, along, indexing="ij"))
+    phases, h = env.memory["phases"], 1e-2
+    dx = turf_height(x + h, y, phases) - turf_height(x - h, y, phases)
+    dy = turf_height(x, y + h, phases) - turf_height(x, y - h, phases)
+    slope, place = (torch.hypot(dx, dy) / (2 * h)).max(1)
+    world = torch.arange(n)
+    x, y = x[world, place], y[world, place]
+    physics = env.physics
+    ball = physics.scene.object_qpos("ball").start
+    qpos, qvel = physics.qpos.clone(), physics.qvel.clone()
+    above = 0.02135 * (1 + slope**2).sqrt()
+    qpos[:, ball : ball + 3] = torch.stack((x, y, turf_height(x, y, phases) + above), -1)
+    state = PhysicsState(qpos, qvel, physics.mocap_pos.clone(), physics.wave_phase.clone())
+    physics.reset(torch.ones(n, dtype=torch.bool), state)
+    for _ in range(60):
+        physics.step(torch.zeros(n, physics.scene.nu))
+    moved = (physics.object_pos[:, 0] - qpos[:, ball : ball + 3]).norm(dim=1)
+    print(f"slopes up to {slope.max():.3f}: moved {moved.max():.1e} m")
+    assert slope.min() > 0.22 and moved.max() < 1e-3
+    env.close()
+
+
+def test_two_engines_play_the_same_stroke():
+    """C MuJoCo and MuJoCo Warp on its CPU device, 30 steps: athlete, flight, rewards."""
+    pytest.importorskip("mujoco_warp")
+    envs = [
+        make_env("golf", engine=engine, num_worlds=3, training=False, seed=3, physics_options=o)
+        for engine, o in (("mujoco", {"threads": 1}), ("warp", {"device": "cpu"}))
+    ]
+    ball = envs[0].physics.scene.object_qpos("ball").start
+    for k in range(30):
+        mine, other = (env.step(swing(env, (k + 1) / 30)) for env in envs)
+        p, q = (env.physics.qpos for env in envs)
+        torch.testing.assert_close(p[:, :ball], q[:, :ball], rtol=0, atol=1e-5)
+        flight = slice(ball, ball + 3)  # a spinning ball's attitude tells a rounding sooner
+        torch.testing.assert_close(p[:, flight], q[:, flight], rtol=0, atol=1e-3)
+        assert torch.equal(envs[0].physics.ball_hits, envs[1].physics.ball_hits)
+        torch.testing.assert_close(mine.reward, other.reward, rtol=0, atol=1e-3)
+        assert torch.equal(mine.ended, other.ended)
+    assert (mine.metrics["contact"] == 1).all()
+    for env in envs:
+        env.close()
+
+
+def test_an_interrupted_stroke_goes_on_where_it_was():
+    """Over waves that the other environment has never had."""
+    options = {"threads": 1}
+    first, second = (
+        make_env("golf", num_worlds=3, seed=s, physics_options=options) for s in (1, 2)
+    )
+    for k in range(15):
+        first.step(swing(first, (k + 1) / 30))
+    second.load_state_dict(first.state_dict())
+    for k in range(15, 60):
+        mine, other = (env.step(swing(env, (k + 1) / 30)) for env in (first, second))
+        assert torch.equal(mine.obs, other.obs) and torch.equal(mine.reward, other.reward)
+    assert (first.memory["met_at"].isfinite() | mine.ended).any()
