@@ -141,6 +141,32 @@ def landing(
     return where, when
 
 
+def landing_on_waves(
+    law: str | BallLaw,
+    pos: Tensor,
+    linvel: Tensor,
+    angvel: Tensor,
+    waves: Sequence[float],
+    phases: Tensor,
+    mask: Tensor | None = None,
+    limit: float = TIME_LIMIT,
+) -> tuple[Tensor, Tensor]:
+    """Where (N, 3) and after how many seconds (N,) balls first touch a surface of waves.
+
+    ``pos``, ``linvel``, ``angvel`` (N, 3); ``waves``: the size of the ``Surface``, an amplitude of
+    0 for flat ground at z = 0; ``phases`` (N, 2). A ball that does not within ``limit`` (s): where
+    it is then, and inf. ``mask`` (N,): worlds that want it; the others get ``pos`` and inf, at no
+    cost.
+    """
+    n = len(pos)
+    wanted = pos.new_ones(n, dtype=torch.bool) if mask is None else mask
+    where, when = pos.new_empty(n, 3), pos.new_empty(n)
+    size = tuple(float(x) for x in waves)
+    arguments = (pos, linvel, angvel, phases, *size, float(limit), wanted)
+    _run("land_on_waves_worlds", n, law, arguments, (where, when))
+    return where, when
+
+
 def crossing(
     law: str | BallLaw,
     pos: Tensor,

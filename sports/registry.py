@@ -8,6 +8,7 @@ from typing import Any
 from sports import (
     boxing,
     fencing,
+    golf,
     high_jump,
     hurdling,
     javelin,
@@ -23,6 +24,7 @@ _ALL = (
     long_jump.TASK,
     hurdling.TASK,
     javelin.TASK,
+    golf.TASK,
     tennis.TASK,
     tennis.DUEL,
     table_tennis.TASK,

@@ -79,6 +79,7 @@ def for_gpu() -> types.SimpleNamespace:
     begin_world, push_world, finish_world = law.begin_world, law.push_world, law.finish_world
     land_world, meet_world = law.land_world, law.meet_world
     path_world, aim_world = law.path_world, law.aim_world
+    land_on_waves_world = law.land_on_waves_world
 
     # Types as values, so that Warp finds them.
     def kernel(function: Callable[..., None], **types_: Any) -> Any:
@@ -102,6 +103,13 @@ def for_gpu() -> types.SimpleNamespace:
     def meet_worlds(p, v, spin, x, limit, ball, pos, time):
         meet_world(wp.tid(), p, v, spin, x, limit, ball, pos, time)
 
+    def land_on_waves_worlds(
+        p, v, spin, phases, amplitude, k, inner, outer, limit, wanted, ball, pos, time
+    ):
+        land_on_waves_world(
+            wp.tid(), p, v, spin, phases, amplitude, k, inner, outer, limit, wanted, ball, pos, time
+        )
+
     def path_worlds(p, v, spin, times_, floor, restitution, friction, ball, path):
         path_world(wp.tid(), p, v, spin, times_, floor, restitution, friction, ball, path)
 
@@ -118,6 +126,10 @@ def for_gpu() -> types.SimpleNamespace:
     )
     law.meet_worlds = kernel(
         meet_worlds, **moving, x=float, limit=float, ball=row, pos=matrix, time=row
+    )
+    swell = dict(phases=matrix, amplitude=float, k=float, inner=float, outer=float, limit=float)
+    law.land_on_waves_worlds = kernel(
+        land_on_waves_worlds, **moving, **swell, wanted=bits, ball=row, pos=matrix, time=row
     )
     bounds = dict(floor=float, restitution=float, friction=float)
     law.path_worlds = kernel(path_worlds, **moving, times_=row, **bounds, ball=row, path=cube)

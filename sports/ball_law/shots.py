@@ -5,16 +5,20 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from sports.ball_law.contact import wave
 from sports.ball_law.flight import (
     GRAVITY,
+    RADIUS,
     TINY,
     Cube,
     Matrix,
+    Quat,
     Row,
     Vector,
     add,
     bounce,
     fly,
+    quat,
     vec,
 )
 
@@ -29,6 +33,10 @@ BOUNCES = 20
 """Most bounces of a path on a plane."""
 NEVER = math.inf
 """The time of what does not happen."""
+STROLL = 0.01
+"""Time step (s) of a flight over waves: 0.3 m at 30 m/s, where a wave is 10 m long."""
+HALVINGS = 12
+"""Of such a step, to find the landing: 2 microseconds."""
 PATIENCE = 5.0
 """The longest flight (s) of a launch."""
 TRIES, SHOTS = 60, 12
@@ -68,6 +76,41 @@ def land(
     if found == 0:
         time = float(NEVER)
     return q, time
+
+
+def above_waves(p: Vector, waves: Quat, a: float, b: float, ball: Row) -> float:
+    """Gap along z between a ball and waves: amplitude, wave number, inner, outer; phases."""
+    h, sx, sy = wave(p[0], p[1], waves[0], waves[1], waves[2], waves[3], a, b)
+    return p[2] - h - ball[RADIUS] * math.sqrt(1.0 + sx * sx + sy * sy)
+
+
+def land_on_waves(
+    p: Vector,
+    v: Vector,
+    spin: Vector,
+    waves: Quat,
+    a: float,
+    b: float,
+    limit: float,
+    ball: Row,
+) -> tuple[Vector, float]:
+    """Where and when (s) a ball first touches waves; where it is at the time limit, and ``NEVER``,
+    where it does not."""
+    q, u = add(p, vec(0.0, 0.0, 0.0)), add(v, vec(0.0, 0.0, 0.0))
+    for k in range(int(limit / STROLL)):
+        r, s = fly(q, u, spin, STROLL, ball)
+        if above_waves(r, waves, a, b, ball) <= 0.0:
+            early, late = float(0.0), float(STROLL)
+            for _ in range(HALVINGS):
+                h = 0.5 * (early + late)
+                r, s = fly(q, u, spin, h, ball)
+                if above_waves(r, waves, a, b, ball) <= 0.0:
+                    late = h
+                else:
+                    early = h
+            return r, STROLL * float(k) + late
+        q, u = r, s
+    return q, float(NEVER)
 
 
 def meet(
@@ -239,6 +282,32 @@ def land_world(
     time[i] = when
 
 
+def land_on_waves_world(
+    i: int,
+    p: Matrix,
+    v: Matrix,
+    spin: Matrix,
+    phases: Matrix,
+    amplitude: float,
+    k: float,
+    inner: float,
+    outer: float,
+    limit: float,
+    wanted: Bits,
+    ball: Row,
+    pos: Matrix,
+    time: Row,
+) -> None:
+    """``land_on_waves`` of world ``i`` where it is wanted, written to ``pos`` and ``time``."""
+    where, when = read(p, i), float(NEVER)
+    if wanted[i]:
+        waves = quat(amplitude, k, inner, outer)
+        a, b = float(phases[i, 0]), float(phases[i, 1])
+        where, when = land_on_waves(where, read(v, i), read(spin, i), waves, a, b, limit, ball)
+    put(pos, i, where)
+    time[i] = when
+
+
 def meet_world(
     i: int,
     p: Matrix,
@@ -310,6 +379,28 @@ def land_worlds(
     """``land_world`` of all worlds, on a CPU."""
     for i in range(len(p)):
         land_world(i, p, v, spin, height, limit, ball, pos, time)
+
+
+def land_on_waves_worlds(
+    p: Matrix,
+    v: Matrix,
+    spin: Matrix,
+    phases: Matrix,
+    amplitude: float,
+    k: float,
+    inner: float,
+    outer: float,
+    limit: float,
+    wanted: Bits,
+    ball: Row,
+    pos: Matrix,
+    time: Row,
+) -> None:
+    """``land_on_waves_world`` of all worlds, on a CPU."""
+    for i in range(len(p)):
+        land_on_waves_world(
+            i, p, v, spin, phases, amplitude, k, inner, outer, limit, wanted, ball, pos, time
+        )
 
 
 def meet_worlds(

@@ -126,7 +126,9 @@ def test_the_first_ball_is_let_go_over_the_net():
     assert speed[:, 0].min() >= 2.0 and speed[:, 0].max() <= 3.0
     assert speed[:, 1].abs().max() <= 0.4 and (speed[:, 2] == 0.0).all()
     assert speed[:, 0].max() > 2.9 and speed[:, 1].min() < -0.3 and speed[:, 1].max() > 0.3
-    spot = where_through(flights("table_tennis", np.tile((0, 0, 1.4), (64, 1)), speed.numpy()), 2, 0.78)
+    spot = where_through(
+        flights("table_tennis", np.tile((0, 0, 1.4), (64, 1)), speed.numpy()), 2, 0.78
+    )
     assert spot[:, 0].min() > 0.5 and spot[:, 0].max() < 1.3  # on the near half of the table
 
 
@@ -271,7 +273,9 @@ def test_a_point_is_fed_to_either_side_and_won_by_one():
     step = world.go((-0.9, 0.1, 0.9), (-2.4, 0.2, 2.0))
     assert not step.terminated.any() and step.terms["approach"][0, 0] == 0.0
     world.touch("racket1", (-1.6, 0.2, 1.0))
-    step = world.go((-1.25, -0.3, 1.05), tuple(-v if i < 2 else v for i, v in enumerate(aimed(-0.8, 0.0))))
+    step = world.go(
+        (-1.25, -0.3, 1.05), tuple(-v if i < 2 else v for i, v in enumerate(aimed(-0.8, 0.0)))
+    )
     assert step.terms["landing"][0, 1] >= 1.0 and step.terms["landing"][0, 0] == 0.0
     world.touch("table", (0.8, 0.0, 0.78))
     world.go((0.9, 0.0, 0.9), (4.0, 0.0, 2.0))

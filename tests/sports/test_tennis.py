@@ -221,9 +221,7 @@ def test_a_ball_that_is_not_returned_is_lost():
     assert not step.success[0]
 
 
-@pytest.mark.parametrize(
-    ("x", "lost"), [(15.85, False), (15.95, True)]
-)
+@pytest.mark.parametrize(("x", "lost"), [(15.85, False), (15.95, True)])
 def test_a_ball_behind_the_athlete_is_lost(x, lost):
     assert far(rally().go((x, 3.0, 1.0))) is lost
 
@@ -375,7 +373,9 @@ def test_a_point_is_fed_to_either_side():
     assert (world.state.qpos[:, q][:, :3] == torch.tensor((0.0, 0.0, 2.5))).all()
     assert (speed.abs() >= 10).all() and (speed.abs() <= 12).all()
     assert 10 < (speed > 0).sum() < 54
-    way = flights("tennis", np.tile((0.0, 0.0, 2.5), (64, 1)), world.state.qvel[:, v][:, :3].numpy())
+    way = flights(
+        "tennis", np.tile((0.0, 0.0, 2.5), (64, 1)), world.state.qvel[:, v][:, :3].numpy()
+    )
     spot = where_through(way, 2, 0.032)
     assert (np.abs(spot[:, 0]) > 6).all() and (np.abs(spot[:, 0]) < 9).all()
 
@@ -439,7 +439,11 @@ def test_both_options_of_the_net_stand_where_the_rules_say():
         for y in (0.1, 5.0285):
             data = mujoco.MjData(model)
             mujoco.mj_forward(model, data)
-            above, down, geom = np.array((0.0, y, 3.0)), np.array((0.0, 0.0, -1.0)), np.zeros(1, "i")
+            above, down, geom = (
+                np.array((0.0, y, 3.0)),
+                np.array((0.0, 0.0, -1.0)),
+                np.zeros(1, "i"),
+            )
             tops.append(3.0 - mujoco.mj_ray(model, data, above, down, None, True, -1, geom))
         assert tops == pytest.approx(heights, abs=1e-3)
     with pytest.raises(ValueError, match="net must be"):
