@@ -264,9 +264,12 @@ class Env:
         return proprioception(view.physics, view.heading, tuple(goal.values())).nan_to_num_()
 
     def snapshot(self) -> dict[str, Tensor]:
-        """Copies of qpos, qvel, mocap_pos and ground_force, for recordings."""
+        """Copies of qpos, qvel, mocap_pos and ground_force, for recordings, and of what the task
+        shows (``shown/NAME``)."""
         physics = self.physics
+        shown = self.task.shown(self.view, self.memory) if self.task.shown else {}
         return {
+            **{f"shown/{name}": value.clone() for name, value in shown.items()},
             "qpos": physics.qpos.clone(),
             "qvel": physics.qvel.clone(),
             "mocap_pos": physics.mocap_pos.clone(),

@@ -169,6 +169,9 @@ class Task:
     """(view, memory, advance, ended (N,)) -> new curriculum state."""
     age_at_start: bool = True
     """Whether training starts episodes' truncation clocks at random ages."""
+    shown: Callable[[View, Memory], dict[str, Tensor]] | None = None
+    """(view, memory) -> what recordings keep of the field in each world, for pictures: (N, k) by
+    name. ``target`` (x, y) or (x, y, z) where there is one (m), ``waves`` the phases of golf's."""
     summary: str = ""
     notes: Mapping[str, str] = field(default_factory=dict)
 
