@@ -99,7 +99,9 @@ def _fitted(points: np.ndarray, view: View) -> View:
     wide = np.ptp(a) * view.height_px / view.width_px
     metres = max(float(wide), float(np.ptp(b)), SMALLEST / MARGIN) * MARGIN
     target = (
-        (a.max() + a.min()) / 2 * right + (b.max() + b.min()) / 2 * up + (c.max() + c.min()) / 2 * into
+        (a.max() + a.min()) / 2 * right
+        + (b.max() + b.min()) / 2 * up
+        + (c.max() + c.min()) / 2 * into
     )
     return replace(view, target=target, height=metres)
 

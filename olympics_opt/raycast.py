@@ -338,9 +338,7 @@ def draw(
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def _shadows(
-    view: View, solids: Sequence[Solid], points: np.ndarray, rough: float
-) -> np.ndarray:
+def _shadows(view: View, solids: Sequence[Solid], points: np.ndarray, rough: float) -> np.ndarray:
     """(H, W) how much of the sun solids keep from ground points (H, W, 3), 0..1."""
     shadow = np.zeros(points.shape[:2])
     for solid in solids:

@@ -88,9 +88,7 @@ def _trail(ink: Any, view: View, path: np.ndarray) -> None:
         ink.ellipse((x - r, y - r, x + r, y + r), outline=TRAIL, width=1)
 
 
-def _free_corner(
-    player: Player, frame: int, view: View, size: tuple[int, int]
-) -> tuple[int, int]:
+def _free_corner(player: Player, frame: int, view: View, size: tuple[int, int]) -> tuple[int, int]:
     """Where in a wide picture an inset hides the fewest athletes and balls; the upper right
     corner where all are as good."""
     width, height = view.width_px, view.height_px
@@ -225,9 +223,7 @@ def render_sheet(
     return write_bytes(path, buffer.getvalue())
 
 
-def _strip(
-    player: Player, title: str, columns: int | None, panel: tuple[int, int] | None
-) -> Any:
+def _strip(player: Player, title: str, columns: int | None, panel: tuple[int, int] | None) -> Any:
     """The frames of one recording under their title."""
     from PIL import Image, ImageDraw
 

@@ -56,7 +56,7 @@ class Recording:
     limits: str = "paper"
     timestep_divisor: int = 1
     shown: dict[str, np.ndarray] = field(default_factory=dict)
-    """(T, k) what pictures need to know of the field in this world, by name (``Task.shown``)."""
+    """(T, ...) what pictures need to know of the field in this world, by name (``Task.shown``)."""
     meta: dict[str, Any] = field(default_factory=dict)
     """Plain JSON: commit, policy sha256, ..."""
 

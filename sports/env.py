@@ -267,9 +267,9 @@ class Env:
         """Copies of qpos, qvel, mocap_pos and ground_force, for recordings, and of what the task
         shows (``shown/NAME``)."""
         physics = self.physics
-        shown = self.task.shown(self.view, self.memory) if self.task.shown else {}
+        shown = {k: self.memory[k].clone() for k in self.task.shown if k in self.memory}
         return {
-            **{f"shown/{name}": value.clone() for name, value in shown.items()},
+            **{f"shown/{name}": value for name, value in shown.items()},
             "qpos": physics.qpos.clone(),
             "qvel": physics.qvel.clone(),
             "mocap_pos": physics.mocap_pos.clone(),

@@ -5,8 +5,8 @@ touches physics. World frame, z up, play along +x; m.
 
 A scene is looked up by its name, which is its task's; `tennis_1v1` looks like `tennis`. What
 differs between worlds comes from the recording: ``shown`` holds, by name, what the sport says of
-the field in that world, (T, k) each: ``target`` (x, y[, z]) where there is one, and the phases of
-golf's waves, ``waves`` (a, b).
+the field in that world (``Task.shown``): ``target`` (T, 3) or (T, A, 3) m, of each athlete, and
+the ``phases`` of golf's waves, (T, 2) rad.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def ground_marks(scene: Scene) -> list[Mark]:
 
 def terrain(scene: Scene, shown: Shown | None = None) -> Terrain | None:
     """The waves of a golf course, where the recording says how they lie; None on flat ground."""
-    phases = np.asarray((shown or {}).get("waves", np.zeros(0)), dtype=float)
+    phases = np.asarray((shown or {}).get("phases", np.zeros(0)), dtype=float)
     if not phases.size or not np.isfinite(phases).all():
         return None
     a, b = phases.reshape(-1, 2)[0].tolist()
@@ -124,25 +124,19 @@ def dressed(scene: Scene, shown: Shown | None = None) -> tuple[Scene, np.ndarray
     Returns the scene, and (T, K, 3) or (1, K, 3) positions of the props that move, which are the
     last of its mocap objects.
     """
-    found, shown = look(scene), shown or {}
+    found, places = look(scene), np.zeros((1, 0, 3))
     if found is None:
-        return scene, np.zeros((1, 0, 3))
-    props, target = found.props(scene), np.asarray(shown.get("target", np.zeros((0, 2))))
-    places = np.zeros((1, 0, 3))
+        return scene, places
+    props, target = found.props(scene), np.asarray((shown or {}).get("target", ()), dtype=float)
     if target.size:
-        moved = found.target(scene)
-        props = [*props, *moved]
-        places = np.repeat(_on_ground(target, terrain(scene, shown))[:, None], len(moved), axis=1)
+        spots = target.reshape(len(target), -1, 3)  # (T, A, 3), of one or each athlete
+        flags = found.target(scene)
+        props = [
+            *props,
+            *(replace(o, name=f"{o.name}{a}") for a in range(spots.shape[1]) for o in flags),
+        ]
+        places = np.repeat(spots, len(flags), axis=1)
     return replace(scene, objects=(*scene.objects, *props)), places
-
-
-def _on_ground(target: np.ndarray, ground: Terrain | None) -> np.ndarray:
-    """(T, 3) targets (T, 2) on the ground, or (T, 3) as they are."""
-    target = np.atleast_2d(np.asarray(target, dtype=float))
-    if target.shape[1] == 3:
-        return target
-    x, y = target[:, 0], target[:, 1]
-    return np.stack((x, y, np.zeros_like(x) if ground is None else ground.height(x, y)), axis=1)
 
 
 def complete_qpos(scene: Scene, qpos: np.ndarray) -> np.ndarray:

@@ -7,13 +7,13 @@ Sources: ITF Rules of Tennis 1; ITTF laws 2.1 and 2.2; FIE rules t.13 to t.17; A
 from __future__ import annotations
 
 from olympics_opt.scenery.paint import PAINT, Mark, across, along, border, rectangle
-from olympics_opt.scenery.props import box, has, net_box, prop, rod
+from olympics_opt.scenery.props import box, prop, rod
 from sports.scene import Scene, SceneObject
 
 # Tennis: half lengths (m). Singles and doubles side lines; lines at most 5 cm, base lines 10 cm.
 BASE_X, SINGLES_Y, DOUBLES_Y, SERVICE_X = 11.885, 4.115, 5.485, 6.40
 LINE, BASE_LINE, CENTRE_MARK = 0.05, 0.10, 0.10
-POST_Y, NET_HEIGHT = SINGLES_Y + 0.914, 1.0
+POST_Y, POST_HEIGHT = SINGLES_Y + 0.914, 1.07
 COURT, AROUND = "#86b08c", "#b4cdb0"
 
 # Table tennis (m): half lengths, side lines 2 cm, centre line 3 mm (drawn 8 mm wide).
@@ -31,8 +31,6 @@ RING = 2.5
 APRON = 0.85
 """The floor goes on this far beyond the ropes (m)."""
 CANVAS, EDGE = "#c3d2de", "#8fa5b8"
-ROPES = (0.4, 0.7, 1.0, 1.3)
-"""Heights of the four ropes (m)."""
 CORNERS = ("#cf3b30", "#f2f2f2", "#2f6fd0", "#f2f2f2")
 
 
@@ -48,23 +46,23 @@ def tennis(scene: Scene) -> list[Mark]:
         marks += [
             across(s * (BASE_X - BASE_LINE / 2), -DOUBLES_Y, DOUBLES_Y, BASE_LINE),
             across(s * (SERVICE_X - LINE / 2), -SINGLES_Y, SINGLES_Y, LINE),
-            rectangle(*sorted((s * BASE_X, s * (BASE_X - CENTRE_MARK))), -LINE / 2, LINE / 2, PAINT),
+            rectangle(
+                *sorted((s * BASE_X, s * (BASE_X - CENTRE_MARK))), -LINE / 2, LINE / 2, PAINT
+            ),
         ]
     marks.append(along(0.0, -SERVICE_X, SERVICE_X, LINE))
     return marks
 
 
 def tennis_props(scene: Scene) -> list[SceneObject]:
-    """Posts, the tape on the net, and the net itself where the scene has none to draw."""
-    top = _net_top(scene, NET_HEIGHT)
+    """Posts, and the tape on a net that is level."""
+    net = [o for o in scene.objects if o.name.startswith("net")]
+    level = len(net) == 1
+    top = _top(net[0]) if level else POST_HEIGHT
     posts = [rod((0.0, s * POST_Y, 0.0), (0.0, s * POST_Y, top), 0.04) for s in (-1.0, 1.0)]
-    half = top / 2
-    found = [
-        prop("posts", "#4a5560", posts),
-        prop("tape", PAINT, [box((0.0, 0.0, top - 0.025), (0.012, POST_Y, 0.025))]),
-    ]
-    if not has(scene, "net"):
-        found.append(net_box("net", (0.0, 0.0, half), (0.008, POST_Y, half), "#39424b"))
+    found = [prop("posts", "#4a5560", posts)]
+    if level:
+        found.append(prop("tape", PAINT, [box((0.0, 0.0, top - 0.025), (0.015, POST_Y, 0.025))]))
     return found
 
 
@@ -74,7 +72,7 @@ def table_tennis(scene: Scene) -> list[Mark]:
 
 
 def table_tennis_props(scene: Scene) -> list[SceneObject]:
-    """Lines on the table, its legs and net, and the table where the scene has none to draw."""
+    """Lines on the table, its legs, and the tape on its net."""
     up, thin = TABLE_Z + 0.001, 0.0015
     lines = [
         box((0.0, s * (TABLE_Y - TABLE_LINE / 2), up), (TABLE_X, TABLE_LINE / 2, thin))
@@ -90,19 +88,12 @@ def table_tennis_props(scene: Scene) -> list[SceneObject]:
         for sx in (-1, 1)
         for sy in (-1, 1)
     ]
-    net_y, half = TABLE_Y + OVERHANG, TABLE_NET / 2
-    top = TABLE_Z + TABLE_NET
-    found = [
+    tape = box((0.0, 0.0, TABLE_Z + TABLE_NET - 0.006), (0.008, TABLE_Y + OVERHANG, 0.006))
+    return [
         prop("lines", PAINT, lines),
         prop("legs", "#4a5560", legs),
-        prop("tape", PAINT, [box((0.0, 0.0, top - 0.006), (0.004, net_y, 0.006))]),
+        prop("tape", PAINT, [tape]),
     ]
-    if not has(scene, "net"):
-        found.append(net_box("net", (0.0, 0.0, TABLE_Z + half), (0.002, net_y, half), "#39424b"))
-    if not has(scene, "table"):
-        top = box((0.0, 0.0, TABLE_Z - 0.02), (TABLE_X, TABLE_Y, 0.02))
-        found.append(prop("table", "#2f5d7e", [top]))
-    return found
 
 
 def fencing(scene: Scene) -> list[Mark]:
@@ -134,25 +125,16 @@ def boxing(scene: Scene) -> list[Mark]:
 
 
 def boxing_props(scene: Scene) -> list[SceneObject]:
-    """Corner posts in their colours, and ropes where the scene has none to draw."""
-    places = [(-1, -1), (-1, 1), (1, 1), (1, -1)]
+    """Corner posts in their colours."""
     r = RING + 0.08
-    found = [
-        prop(f"corner{i}", color, [rod((x * r, y * r, 0.0), (x * r, y * r, 1.42), 0.05)])
+    places = [(-r, -r), (-r, r), (r, r), (r, -r)]
+    return [
+        prop(f"corner{i}", color, [rod((x, y, 0.0), (x, y, 1.42), 0.05)])
         for i, ((x, y), color) in enumerate(zip(places, CORNERS))
     ]
-    if not has(scene, "rope"):
-        ropes = []
-        for z in ROPES:
-            for (x0, y0), (x1, y1) in zip(places, places[1:] + places[:1]):
-                ropes.append(rod((x0 * RING, y0 * RING, z), (x1 * RING, y1 * RING, z), 0.02))
-        found.append(prop("ropes", "#e8e2d6", ropes, alpha=0.75))
-    return found
 
 
-def _net_top(scene: Scene, otherwise: float) -> float:
-    """Height of the scene's own net (m), where it is one box."""
-    for o in scene.objects:
-        if "net" in o.name and len(o.shapes) == 1 and o.shapes[0].kind == "box":
-            return o.pos[2] + o.shapes[0].center[2] + o.shapes[0].size[2]
-    return otherwise
+def _top(net: SceneObject) -> float:
+    """Height of a net that is one upright box (m)."""
+    shape = net.shapes[0]
+    return net.pos[2] + shape.center[2] + shape.size[2]

@@ -90,7 +90,12 @@ def flag(scene: Scene) -> list[SceneObject]:
     return [
         prop("target_pole", "#f4f4ef", [pole], motion="mocap"),
         prop("target_flag", "#d8322a", cloth, motion="mocap"),
-        prop("target_hole", "#25302a", [plate((0, 0, -0.01), (0, 0, 0.012), 2 * HOLE)], motion="mocap"),
+        prop(
+            "target_hole",
+            "#25302a",
+            [plate((0, 0, -0.01), (0, 0, 0.012), 2 * HOLE)],
+            motion="mocap",
+        ),
     ]
 
 

@@ -40,7 +40,9 @@ def rectangle(x0: float, x1: float, y0: float, y1: float, color: str, label: str
     return Mark(((x0, y0), (x1, y0), (x1, y1), (x0, y1)), color, label)
 
 
-def across(x: float, y0: float, y1: float, width: float, color: str = PAINT, label: str = "") -> Mark:
+def across(
+    x: float, y0: float, y1: float, width: float, color: str = PAINT, label: str = ""
+) -> Mark:
     """A line along y in the middle of which is ``x``."""
     return rectangle(x - width / 2, x + width / 2, y0, y1, color, label)
 
@@ -50,7 +52,9 @@ def along(y: float, x0: float, x1: float, width: float, color: str = PAINT) -> M
     return rectangle(x0, x1, y - width / 2, y + width / 2, color)
 
 
-def border(x0: float, x1: float, y0: float, y1: float, width: float, color: str = PAINT) -> list[Mark]:
+def border(
+    x0: float, x1: float, y0: float, y1: float, width: float, color: str = PAINT
+) -> list[Mark]:
     """Four lines *inside* a rectangle: a field's lines belong to it."""
     return [
         rectangle(x0, x0 + width, y0, y1, color),
