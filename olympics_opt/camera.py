@@ -50,11 +50,12 @@ class Stand:
 
 _STANDS = {
     "javelin": Stand(pitch=9.0),
-    "golf": Stand(pitch=24.0),
-    "tennis": Stand(pitch=18.0, anchors=((-12.0, 0.0, 0.0),)),
+    "golf": Stand(azimuth=58.0, pitch=26.0),
+    # From behind the athlete, as on television: along the court it would be a narrow strip.
+    "tennis": Stand(azimuth=145.0, pitch=24.0, anchors=((-11.9, 0.0, 0.0), (11.9, 0.0, 0.0))),
     "table_tennis": Stand(pitch=14.0, anchors=((-1.4, 0.0, 0.7), (1.4, 0.0, 0.7))),
-    "fencing": Stand(pitch=9.0),
-    "boxing": Stand(pitch=12.0),
+    "fencing": Stand(azimuth=84.0, pitch=9.0),
+    "boxing": Stand(azimuth=74.0, pitch=12.0),
     "penalty_kick": Stand(
         azimuth=62.0, pitch=17.0, anchors=((16.0, -2.2, 0.0), (16.0, 2.2, 0.0), (16.0, 2.2, 2.2))
     ),
@@ -89,6 +90,7 @@ def must_show(player: Player, frame: int, view: View) -> np.ndarray:
         points += [p + s * BALL * axis for axis in (right, up) for s in (1, -1)]
     own = stand(player.scene)
     points += [np.asarray(a) for a in own.anchors] if own else []
+    points += list(player.targets(frame))
     return np.array(points)
 
 

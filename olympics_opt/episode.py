@@ -76,6 +76,7 @@ class Player:
         count = len(self.qpos)
         self.mocap = np.concatenate([_lasting(x, count) for x in (mocap, places)], axis=1)
         """(T, M, 3) positions of the fixtures, the props among them last."""
+        self._targets = places.shape[1]
         self._rows = [self.model.body(o.name).mocapid[0] for o in scene.mocap_objects]
         own = [shape_colors(scene, agent) for agent in range(scene.num_agents)]
         colors = {
@@ -130,6 +131,10 @@ class Player:
         """(T, A, 3) where the athletes are."""
         slices = [self.scene.agent_qpos(agent) for agent in range(self.scene.num_agents)]
         return np.stack([self.qpos[:, s][:, :3] for s in slices], axis=1)
+
+    def targets(self, frame: int) -> np.ndarray:
+        """(K, 3) where the props at targets stand."""
+        return self.mocap[frame, self.mocap.shape[1] - self._targets :]
 
     def thing(self, name: str) -> np.ndarray:
         """(T, 3) where a moving object is."""

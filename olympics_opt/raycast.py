@@ -86,11 +86,6 @@ class View:
         """Pixels per metre."""
         return self.height_px / self.height
 
-    @property
-    def grid(self) -> float:
-        """Distance of the lines of the ground's grid and of the ruler (m)."""
-        return 1.0 if self.scale >= 28 else 5.0 if self.scale >= 6 else 10.0
-
     def project(self, points: np.ndarray) -> np.ndarray:
         """(..., 2) pixel coordinates (x right, y down) of world points (..., 3)."""
         right, up, _ = self.axes
@@ -109,6 +104,11 @@ class View:
         x = (np.arange(self.width_px)[cols] + 0.5 - self.width_px / 2) / self.scale
         y = (self.height_px / 2 - np.arange(self.height_px)[rows] - 0.5) / self.scale
         return self.target + x[None, :, None] * right + y[:, None, None] * up
+
+
+def grid_step(view: View) -> float:
+    """Distance of the lines of the ground's grid and of the ruler (m): 1, 5 or 10."""
+    return 1.0 if view.scale >= 40 else 5.0 if view.scale >= 8 else 10.0
 
 
 def _ball(o: np.ndarray, d: np.ndarray, center: float, radius: float) -> np.ndarray:
@@ -208,14 +208,20 @@ def _lines(x: np.ndarray, width: float, step: float) -> np.ndarray:
 
 
 def _ground(
-    view: View, marks: Sequence[Mark], hit: np.ndarray, points: np.ndarray, rough: float, k: int
+    view: View,
+    marks: Sequence[Mark],
+    hit: np.ndarray,
+    points: np.ndarray,
+    rough: float,
+    step: float,
+    k: int,
 ) -> np.ndarray:
-    """(H, W, 3) colours of the ground: plain, grid, painted marks; ``rough``: how far it may lie
-    above or below z = 0 (m), ``k``: the view's pixels to one of the picture."""
+    """(H, W, 3) colours of the ground: plain, a grid of ``step`` (m), painted marks; ``rough``:
+    how far it may lie above or below z = 0 (m), ``k``: the view's pixels to one of the picture."""
     image = np.broadcast_to(GROUND, points.shape).copy()
     right, up, into = view.axes
     line = 1.2 / view.scale
-    grid = np.maximum(*(_lines(points[..., i], line, view.grid) for i in (0, 1)))
+    grid = np.maximum(*(_lines(points[..., i], line, step) for i in (0, 1)))
     image -= 0.07 * grid[..., None]
     foot = np.stack((right[:2], up[:2] / max(into[2] ** 2, 1e-6)), axis=1) * k / view.scale
     for mark in marks:
@@ -297,6 +303,7 @@ def draw(
         (height_px, width_px, 3) uint8 picture.
     """
     k = supersample
+    step = grid_step(view)
     view = replace(view, width_px=view.width_px * k, height_px=view.height_px * k)
     right, _up, into = view.axes
     origins = view.origins(slice(None), slice(None))
@@ -312,7 +319,7 @@ def draw(
         z = back[..., 2] + t * into[2]
         along = (back + t[..., None] * into) @ right
         line = 1.2 / view.scale
-        grid = np.maximum(_lines(z, line, view.grid), _lines(along, line, view.grid)) * (z > 0)
+        grid = np.maximum(_lines(z, line, step), _lines(along, line, step)) * (z > 0)
         image -= 0.08 * grid[..., None]
 
     t_ground = back[..., 2] / max(-into[2], 1e-9) if ground is None else _waves(view, ground, back)
@@ -320,10 +327,11 @@ def draw(
     flat = np.array([into[0], into[1]]) / math.hypot(into[0], into[1])
     hit = ((points[..., :2] - view.target[:2]) @ flat < view.horizon) & np.isfinite(t_ground)
     rough = 0.0 if ground is None else ground.highest
-    tone = _ground(view, marks, hit, points, rough, k)
+    tone = _ground(view, marks, hit, points, rough, step, k)
     if ground is not None:
         n = ground.normal(points[..., 0], points[..., 1])
         tone *= (0.45 + 0.55 * np.clip(n @ SUN, 0, 1) / SUN[2])[..., None]
+        tone *= 1.0 + 0.12 * points[..., 2:] / ground.highest  # crests are paler than hollows
     tone *= (1.0 - 0.28 * _shadows(view, solids, points, rough))[..., None]
     image[hit] = tone[hit]
     depth = np.where(hit, t_ground, np.inf)

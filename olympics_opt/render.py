@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from olympics_opt.camera import inset, shots, stand, things
+from olympics_opt.camera import inset, must_show, shots, stand, things
 from olympics_opt.episode import Episode, Player, Window, decisive_window, touching
 from olympics_opt.moments import FRAMES, Event, chosen_frames, events, sheet_frames
 from olympics_opt.raycast import View, draw
@@ -62,12 +62,14 @@ def picture(player: Player, frame: int, view: View, marks: Sequence[Mark], since
     solids, ruler = player.solids(frame), view.pitch < RULER_BELOW
     image = Image.fromarray(draw(solids, view, marks, ground=player.ground, ruler=ruler))
     ink = ImageDraw.Draw(image)
-    for name in things(player.scene):
-        _trail(ink, view, player.thing(name)[since : frame + 1])
+    ways = [player.thing(name)[since : frame + 1] for name in things(player.scene)]
+    for way in ways:
+        _trail(ink, view, way)
     close = inset(player, frame, view)
     if close is not None:
         small = Image.fromarray(draw(solids, close, marks, ground=player.ground, ruler=False))
-        at = _free_corner(player, frame, view, small.size)
+        seen = view.project(np.concatenate((must_show(player, frame, view), *ways)))
+        at = _free_corner(seen, view, small.size)
         image.paste(small, at)
         edge = (at[0] - 1, at[1] - 1, at[0] + small.width, at[1] + small.height)
         ink.rectangle(edge, outline=(255, 255, 255), width=2)
@@ -88,12 +90,10 @@ def _trail(ink: Any, view: View, path: np.ndarray) -> None:
         ink.ellipse((x - r, y - r, x + r, y + r), outline=TRAIL, width=1)
 
 
-def _free_corner(player: Player, frame: int, view: View, size: tuple[int, int]) -> tuple[int, int]:
-    """Where in a wide picture an inset hides the fewest athletes and balls; the upper right
-    corner where all are as good."""
+def _free_corner(seen: np.ndarray, view: View, size: tuple[int, int]) -> tuple[int, int]:
+    """Where in a wide picture an inset hides the fewest of the points ``seen`` (K, 2); the upper
+    right corner where all are as good."""
     width, height = view.width_px, view.height_px
-    seen = [view.project(p) for p in player.roots()[frame]]
-    seen += [view.project(player.thing(n)[frame]) for n in things(player.scene)]
     edge, top = 8, 26
     places = [
         (width - size[0] - edge, top),
@@ -104,7 +104,7 @@ def _free_corner(player: Player, frame: int, view: View, size: tuple[int, int]) 
 
     def hidden(at: tuple[int, int]) -> float:
         middle = np.array(at) + np.array(size) / 2
-        room = np.array(size) / 2 + 25
+        room = np.array(size) / 2 + 6
         return sum(float((np.abs(p - middle) < room).all()) for p in seen)
 
     return min(places, key=hidden)

@@ -72,7 +72,7 @@ def table_tennis(scene: Scene) -> list[Mark]:
 
 
 def table_tennis_props(scene: Scene) -> list[SceneObject]:
-    """Lines on the table, its legs, and the tape on its net."""
+    """Lines on the table, and the tape on its net."""
     up, thin = TABLE_Z + 0.001, 0.0015
     lines = [
         box((0.0, s * (TABLE_Y - TABLE_LINE / 2), up), (TABLE_X, TABLE_LINE / 2, thin))
@@ -83,15 +83,9 @@ def table_tennis_props(scene: Scene) -> list[SceneObject]:
         for s in (-1.0, 1.0)
     ]
     lines.append(box((0.0, 0.0, up), (TABLE_X, TABLE_CENTRE / 2, thin)))
-    legs = [
-        rod((sx * 1.05, sy * 0.6, 0.03), (sx * 1.05, sy * 0.6, TABLE_Z - 0.06), 0.025)
-        for sx in (-1, 1)
-        for sy in (-1, 1)
-    ]
     tape = box((0.0, 0.0, TABLE_Z + TABLE_NET - 0.006), (0.008, TABLE_Y + OVERHANG, 0.006))
     return [
         prop("lines", PAINT, lines),
-        prop("legs", "#4a5560", legs),
         prop("tape", PAINT, [tape]),
     ]
 
