@@ -146,13 +146,11 @@ def tracking(player: Player, width: int, height: int) -> list[View]:
         return [View(t, azimuth, pitch, metres, width, height) for t in targets]
     plain = _plain(player, width, height)
     views = [_fitted(must_show(player, f, plain), plain) for f in range(count)]
-    reach = max(1, round(0.5 / player.episode.dt))
+    targets = smooth(np.array([v.target for v in views]), 0.3 / player.episode.dt)
+    # The target lags behind: what leaves the picture on one side needs as much room as it lags.
+    lag = np.array([np.linalg.norm(v.target - t) for v, t in zip(views, targets)])
     heights = np.array([v.height for v in views])
-    # What comes half a second later must fit already, or it would leave the picture.
-    heights = np.array([heights[max(0, i - reach) : i + reach + 1].max() for i in range(count)])
-    sigma = 0.3 / player.episode.dt
-    tops = smooth(heights[:, None], sigma)[:, 0]
-    targets = smooth(np.array([v.target for v in views]), sigma)
+    tops = _steady(heights + 2 * lag, player.episode.dt)
     return [replace(v, target=t, height=h) for v, t, h in zip(views, targets, tops)]
 
 
@@ -207,11 +205,33 @@ def inset(player: Player, frame: int, view: View) -> View | None:
     )
 
 
-def focus(player: Player) -> tuple[np.ndarray, float]:
-    """(T, 3) the point a perspective camera looks at, smoothed, and how high (m) a picture must
-    be to hold the widest of its frames."""
-    views = tracking(player, 960, 540)
-    return np.array([v.target for v in views]), max(v.height for v in views)
+def focus(player: Player, lens: float, aspect: float = 16 / 9) -> tuple[np.ndarray, np.ndarray]:
+    """Where a perspective camera looks and from how far, smoothed: (T, 3) points, (T,) metres.
+
+    ``lens``: focal length over the picture's half height; ``aspect``: width over height.
+    """
+    views = tracking(player, round(540 * aspect), 540)
+    targets = np.array([v.target for v in views])
+    reach = [
+        _distance(must_show(player, i, view) - view.target, view, lens, aspect)
+        for i, view in enumerate(views)
+    ]
+    return targets, MARGIN * _steady(np.array(reach), player.episode.dt)
+
+
+def _distance(points: np.ndarray, view: View, lens: float, aspect: float) -> float:
+    """How far (m) a camera must be from its target to see points (K, 3) relative to it."""
+    right, up, into = view.axes
+    side, high = np.abs(points @ right) * lens / aspect, np.abs(points @ up) * lens
+    return float((np.maximum(side, high) - points @ into).max())
+
+
+def _steady(sizes: np.ndarray, dt: float) -> np.ndarray:
+    """(T,) sizes (m) smoothed over time, and no smaller than those of the next half second: what
+    comes must fit already, or it would leave the picture."""
+    reach, count = max(1, round(0.5 / dt)), len(sizes)
+    most = np.array([sizes[max(0, i - reach) : i + reach + 1].max() for i in range(count)])
+    return smooth(most[:, None], 0.3 / dt)[:, 0]
 
 
 def smooth(values: np.ndarray, sigma: float) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -227,7 +228,7 @@ def chosen_frames(window: Window, happened: Sequence[Event], count: int = FRAMES
             chosen.add(event.frame)
     while len(chosen) < count:
         order = sorted(chosen)
-        a, b = max(zip(order, order[1:]), key=lambda pair: pair[1] - pair[0])
+        a, b = max(pairwise(order), key=lambda pair: pair[1] - pair[0])
         if b - a < 2:
             break
         chosen.add((a + b) // 2)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from olympics_opt.camera import inset, must_show, shots, stand, things
 from olympics_opt.episode import Episode, Player, Window, decisive_window, touching
-from olympics_opt.moments import FRAMES, Event, chosen_frames, events, sheet_frames
+from olympics_opt.moments import Event, chosen_frames, events, sheet_frames
 from olympics_opt.raycast import View, draw
 from olympics_opt.scenery import LIMBS, Mark, ground_marks
 from olympics_opt.scenery.athletes import SHIRTS
@@ -32,7 +33,7 @@ RULER_BELOW = math.radians(13.0)
 """Cameras tilted further than this see the ground, not the ruler behind the athlete."""
 
 
-def _font(size: int) -> Any:
+def font(size: int) -> Any:
     from PIL import ImageFont
 
     return ImageFont.load_default(size)
@@ -79,7 +80,7 @@ def picture(player: Player, frame: int, view: View, marks: Sequence[Mark], since
 def _trail(ink: Any, view: View, path: np.ndarray) -> None:
     """The way of a ball as dots, one a step, joined where it did not jump to a new place."""
     points = view.project(path)
-    for i, (a, b) in enumerate(zip(points, points[1:])):
+    for i, (a, b) in enumerate(pairwise(points)):
         if np.linalg.norm(path[i + 1] - path[i]) < 2.0:
             ink.line((*a, *b), fill=TRAIL, width=1)
     for x, y in points[:-1]:
@@ -115,12 +116,12 @@ def _panel(player: Player, window: Window, frame: int, image: Any, view: View, w
     from PIL import ImageDraw
 
     ink = ImageDraw.Draw(image)
-    font, small = _font(15), _font(12)
+    large, small = font(15), font(12)
     dark = (30, 38, 46)
     zero = window.takeoff if window.takeoff is not None else 0
     seconds = (frame - zero) * player.episode.dt
     around = {"stroke_width": 2, "stroke_fill": (240, 240, 240)}
-    ink.text((8, 6), f"{seconds:+.2f} s", font=font, fill=dark, **around)
+    ink.text((8, 6), f"{seconds:+.2f} s", font=large, fill=dark, **around)
     at = (view.width_px - 8, 8)
     ink.text(at, _facts(player, frame), font=small, fill=dark, anchor="ra", **around)
     tone = (150, 30, 20) if words not in ("", "in the air") else dark
@@ -143,9 +144,9 @@ def _facts(player: Player, frame: int) -> str:
     return f"{names[0]}  {text}"
 
 
-def _labels(ink: Any, view: View, marks: Sequence[Mark]) -> None:
+def labels(ink: Any, view: View, marks: Sequence[Mark]) -> None:
     """Names of the marks below them."""
-    small, taken = _font(12), []
+    small, taken = font(12), []
     for mark in marks:
         if not mark.label:
             continue
@@ -238,15 +239,15 @@ def _strip(player: Player, title: str, columns: int | None, panel: tuple[int, in
     panels = []
     for frame, view in zip(frames, shots(player, frames, *panel)):
         image = picture(player, frame, view, marks, since=window.start)
-        _labels(ImageDraw.Draw(image), view, marks)
+        labels(ImageDraw.Draw(image), view, marks)
         words = _words(player, window, frame, happened)
         panels.append(_panel(player, window, frame, image, view, words))
     rows = math.ceil(len(panels) / columns)
     strip = Image.new("RGB", (columns * panel[0], 62 + rows * panel[1]), (255, 255, 255))
     ink = ImageDraw.Draw(strip)
-    ink.text((10, 6), title, font=_font(21), fill=(20, 26, 32))
+    ink.text((10, 6), title, font=font(21), fill=(20, 26, 32))
     facts = "   ".join(f"{k} {_number(v)}" for k, v in episode.metrics.items())
-    ink.text((10, 36), facts, font=_font(15), fill=(80, 88, 96))
+    ink.text((10, 36), facts, font=font(15), fill=(80, 88, 96))
     _legend(ink, strip.width, player.scene.num_agents)
     for i, image in enumerate(panels):
         strip.paste(image, (i % columns * panel[0], 62 + i // columns * panel[1]))
@@ -255,12 +256,12 @@ def _strip(player: Player, title: str, columns: int | None, panel: tuple[int, in
 
 def _legend(ink: Any, width: int, agents: int) -> None:
     """Names the limb colours, or the teams', in the upper right corner."""
-    x, font = width - 10, _font(13)
+    x, small = width - 10, font(13)
     teams = {"team 0 (towards +x)": SHIRTS[0], "team 1": SHIRTS[1]}
     for name, color in reversed((LIMBS if agents == 1 else teams).items()):
         label = name.replace("_", " ")
-        x -= int(ink.textlength(label, font=font))
-        ink.text((x, 9), label, font=font, fill=(60, 68, 76))
+        x -= int(ink.textlength(label, font=small))
+        ink.text((x, 9), label, font=small, fill=(60, 68, 76))
         x -= 17
         ink.ellipse((x, 10, x + 13, 23), fill=color)
         x -= 12

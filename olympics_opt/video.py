@@ -15,7 +15,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from olympics_opt.camera import Stand, smooth, stand, tracking
+from olympics_opt.camera import focus, smooth, stand, tracking
 from olympics_opt.decor import decorated
 from olympics_opt.episode import Episode, Player, heading
 from olympics_opt.raycast import SUN, draw
@@ -24,8 +24,6 @@ from olympics_opt.scenery import ground_marks, terrain
 Pictures = Generator[np.ndarray, None, None]
 """(height, width, 3) uint8 frames."""
 
-NEARER = 1.25
-"""A perspective camera stands this much further back than its middle plane asks for."""
 INSTALL_GL = (
     "no GL library works on this machine: `apt-get install libosmesa6` (or libegl1) gives "
     "MuJoCo's renderer one; the software renderer (--renderer software) needs none"
@@ -78,34 +76,28 @@ def _gl_frames(episode: Episode, width: int, height: int) -> Pictures:
     player = Player(episode, partial(decorated, ground=ground))
     renderer = _gl_renderer(player.model, width, height)
     try:
-        solo = stand(player.scene) is None
-        own = stand(player.scene) or Stand()
-        views = tracking(player, width, height)
-        root = smooth(player.qpos[:, :3], 0.25 / episode.dt)
+        own = stand(player.scene)
+        lens = 1.0 / math.tan(math.radians(player.model.vis.global_.fovy) / 2)
         camera = mujoco.MjvCamera()
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        camera.distance, camera.elevation = 4.7, -9.0
-        camera.azimuth = math.degrees(heading(player.qpos)) + 62.0
-        lens = 2 * math.tan(math.radians(player.model.vis.global_.fovy) / 2)
-        if not solo:
+        if own is None:
+            root = smooth(player.qpos[:, :3], 0.25 / episode.dt)
+            looks = root * (1.0, 1.0, 0.75) + (0.35, 0.0, 0.15)
+            away = np.full(len(player), 4.7)
+            camera.azimuth, camera.elevation = math.degrees(heading(player.qpos)) + 62.0, -9.0
+        else:
+            looks, away = focus(player, lens, width / height)
             camera.azimuth, camera.elevation = own.azimuth, -own.pitch
-            # Extents of the scene decide what is clipped and how far shadows reach.
-            player.model.stat.extent = max(5.0, max(v.height for v in views))
+            # The extent of the scene decides what is clipped and how far shadows reach.
+            player.model.stat.extent = max(5.0, float(away.max()))
+        sun = 0.8 * player.model.stat.extent
         for i in range(len(player)):
             player.show(i)
             mujoco.mj_comPos(player.model, player.data)
-            if solo:
-                middle = root[i] * (1.0, 1.0, 0.0)
-                camera.lookat[:] = root[i] * (1.0, 1.0, 0.75) + (0.35, 0.0, 0.15)
-            else:
-                middle = views[i].target * (1.0, 1.0, 0.0)
-                camera.lookat[:] = views[i].target
-                # What is nearer than the point looked at is seen larger: stand further back.
-                camera.distance = max(4.7, views[i].height / lens * NEARER)
             # The sun travels along, so that its shadow map covers the athletes' surroundings.
-            sun = max(4.0, 1.5 * player.model.stat.extent if not solo else 4.0)
-            player.model.light_pos[0] = middle + sun * SUN
+            player.model.light_pos[0] = looks[i] * (1.0, 1.0, 0.0) + sun * SUN
             mujoco.mj_camlight(player.model, player.data)
+            camera.lookat[:], camera.distance = looks[i], max(4.7, away[i])
             renderer.update_scene(player.data, camera)
             yield renderer.render()
     finally:

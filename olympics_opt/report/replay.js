@@ -16,7 +16,7 @@ const Replay = (() => {
       this.qpos = S.unpack(data.qpos);
       this.mocap = data.mocap ? S.unpack(data.mocap) : null;
       this.force = data.force ? S.unpack(data.force) : null;
-      this.metres = data.metres || 0; // how high a picture must be to hold everybody
+      this.distance = data.distance || 0; // from which the camera sees everybody
       this.end = this.start + this.dt * (this.qpos.length - 1);
       // Where the camera looks: what the page says, or the root, averaged over half a second.
       this.aim = data.focus ? S.unpack(data.focus) : null;
@@ -88,8 +88,7 @@ const Replay = (() => {
     }
     const tracks = data.tracks.map((track) => new Track(scene, track));
     const t0 = Math.min(...tracks.map((k) => k.start)), t1 = Math.max(...tracks.map((k) => k.end));
-    // A picture is 2 distance / 2.1 high (see LENS).
-    const far = Math.max(5.4, ...tracks.map((k) => 1.05 * k.metres));
+    const far = Math.max(5.4, ...tracks.map((k) => k.distance));
     const home = () => ({
       yaw: data.yaw, pitch: data.pitch, distance: far, follow: true, pan: [0, 0, 0], fixed: [0, 0, 0],
     });

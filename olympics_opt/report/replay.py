@@ -41,8 +41,8 @@ COLORS = ("#5b6673", "#c2408f", "#1c8a5a", "#8a63d2", "#b58900", "#0f8b8d")
 """Colours of the tracks; the first track's athlete is drawn in its limb colours."""
 TURF_STEP = 0.8
 """Distance of the points of a drawn terrain (m)."""
-ROOM = 1.15
-"""A perspective picture of something high is this much higher."""
+LENS, ASPECT = 2.1, 1.9
+"""Of the page's camera (``replay_draw.js``) and its canvas."""
 
 
 @dataclass(frozen=True)
@@ -175,9 +175,9 @@ def _track(scene: Scene, track: ReplayTrack, color: str) -> dict[str, Any]:
         force = np.where(np.linalg.norm(force, axis=-1, keepdims=True) > 20.0, force, 0.0)
         packed["force"] = pack(np.reshape(force, (len(force), -1)))
     if stand(scene) is not None:
-        path, metres = focus(player)
+        path, away = focus(player, LENS, ASPECT)
         packed["focus"] = pack(_resampled(path, track.dt)[0])
-        packed["metres"] = round(ROOM * metres, 2)
+        packed["distance"] = round(float(away.max()), 2)
     return packed
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from olympics_opt.scenery import athletics, courts, fields, golf
 from olympics_opt.scenery.athletes import LIMBS, link_color, shape_colors, teams
 from olympics_opt.scenery.golf import Terrain
-from olympics_opt.scenery.paint import Mark, rectangle, rgb, ring
+from olympics_opt.scenery.paint import Mark, rectangle, rgb
 from olympics_opt.scenery.props import is_net, plate, prop
 from sports.scene import Scene, SceneObject
 

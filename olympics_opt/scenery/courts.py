@@ -95,7 +95,7 @@ def fencing(scene: Scene) -> list[Mark]:
     marks = [rectangle(-PISTE_X, PISTE_X, -PISTE_Y, PISTE_Y, PISTE)]
     for s in (-1, 1):
         marks += [
-            rectangle(*sorted((s * WARNING_X, s * PISTE_X)), -PISTE_Y, PISTE_Y, WARNING),
+            across(s * (PISTE_X + WARNING_X) / 2, -PISTE_Y, PISTE_Y, PISTE_X - WARNING_X, WARNING),
             across(s * (PISTE_X - 0.025), -PISTE_Y, PISTE_Y, 0.05),
             across(s * GUARD_X, -PISTE_Y, PISTE_Y, 0.04),
         ]

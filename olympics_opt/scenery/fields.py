@@ -8,6 +8,7 @@ the court (lines of 5 cm; three-point line 6.75 m from under the basket, 0.90 m 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 from olympics_opt.scenery.paint import (
     PAINT,
@@ -190,7 +191,7 @@ def _basket(x: float, tag: str, scene: Scene) -> list[SceneObject]:
         turns = [2 * math.pi * i / 16 for i in range(17)]
         r, points = RIM_RADIUS + 0.01, []
         points = [(x + r * math.cos(t), r * math.sin(t), RIM_Z) for t in turns]
-        hoop = [rod(a, b, 0.01) for a, b in zip(points, points[1:])]
+        hoop = [rod(a, b, 0.01) for a, b in pairwise(points)]
         found.append(prop(f"rim{tag}", "#e0592b", hoop))
     return found
 

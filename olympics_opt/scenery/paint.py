@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 PAINT = "#ffffff"
 SEGMENTS = 48
@@ -103,7 +104,7 @@ def ring(
     count = max(1, round(SEGMENTS * abs(end - start) / (2 * math.pi)))
     turns = [start + (end - start) * i / count for i in range(count + 1)]
     marks = []
-    for a, b in zip(turns, turns[1:]):
+    for a, b in pairwise(turns):
         corners = tuple(
             (x + r * math.cos(t), y + r * math.sin(t))
             for r, t in ((radius - width, a), (radius, a), (radius, b), (radius - width, b))
