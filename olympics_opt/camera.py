@@ -78,8 +78,9 @@ def things(scene: Scene) -> tuple[str, ...]:
     return tuple(o.name for o in scene.free_objects if "ball" in o.name or "javelin" in o.name)
 
 
-def must_show(player: Player, frame: int, view: View) -> np.ndarray:
-    """(K, 3) world points that a picture of a frame must hold."""
+def must_show(player: Player, frame: int, view: View, own: Stand | None = None) -> np.ndarray:
+    """(K, 3) world points that a picture of a frame must hold; ``own``: another stand than the
+    sport's."""
     right, up, _ = view.axes
     z = np.array([0.0, 0.0, 1.0])
     points = []
@@ -88,7 +89,7 @@ def must_show(player: Player, frame: int, view: View) -> np.ndarray:
     for name in things(player.scene):
         p = player.thing(name)[frame]
         points += [p + s * BALL * axis for axis in (right, up) for s in (1, -1)]
-    own = stand(player.scene)
+    own = own or stand(player.scene)
     points += [np.asarray(a) for a in own.anchors] if own else []
     points += list(player.targets(frame))
     return np.array(points)
@@ -108,8 +109,7 @@ def _fitted(points: np.ndarray, view: View) -> View:
     return replace(view, target=target, height=metres)
 
 
-def _plain(player: Player, width: int, height: int) -> View:
-    own = stand(player.scene) or Stand()
+def _plain(own: Stand, width: int, height: int) -> View:
     return View(
         np.zeros(3),
         math.radians(own.azimuth),
@@ -126,17 +126,23 @@ def shots(player: Player, frames: Sequence[int], width: int, height: int) -> lis
     own = stand(player.scene)
     if own is None:
         return side_views(player, frames, width, height)
-    plain = _plain(player, width, height)
+    plain = _plain(own, width, height)
     views = [_fitted(must_show(player, f, plain), plain) for f in frames]
     near = [v.height for v in views if v.height <= own.near]
     scales = {True: max(near, default=0.0), False: max((v.height for v in views), default=0.0)}
     return [replace(v, height=scales[v.height <= own.near]) for v in views]
 
 
+def shot(player: Player, frame: int, width: int, height: int, own: Stand) -> View:
+    """The view of one frame from a stand of the caller's."""
+    plain = _plain(own, width, height)
+    return _fitted(must_show(player, frame, plain, own), plain)
+
+
 def tracking(player: Player, width: int, height: int) -> list[View]:
     """A view for every frame, without jerks: for videos."""
-    count = len(player)
-    if stand(player.scene) is None:
+    count, own = len(player), stand(player.scene)
+    if own is None:
         root = smooth(player.qpos[:, :3], 0.15 / player.episode.dt)
         metres = 3.2
         azimuth = heading(player.qpos) + math.pi / 2 - 0.3
@@ -144,7 +150,7 @@ def tracking(player: Player, width: int, height: int) -> list[View]:
         targets = [np.array([p[0], p[1], max(low, p[2] + 0.9 - metres / 2)]) for p in root]
         pitch = math.radians(9.0)
         return [View(t, azimuth, pitch, metres, width, height) for t in targets]
-    plain = _plain(player, width, height)
+    plain = _plain(own, width, height)
     views = [_fitted(must_show(player, f, plain), plain) for f in range(count)]
     targets = smooth(np.array([v.target for v in views]), 0.3 / player.episode.dt)
     # The target lags behind: what leaves the picture on one side needs as much room as it lags.

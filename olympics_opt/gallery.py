@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from olympics_opt.camera import shots, stand
+from olympics_opt.camera import Stand, shot, shots, stand
 from olympics_opt.episode import Episode, Player, decisive_window
 from olympics_opt.moments import events
+from olympics_opt.raycast import View
 from olympics_opt.render import font, labels, picture
 from olympics_opt.scenery import ground_marks
+from sports import hurdling
 from warmstart.atomic import write_bytes
 
 TILE, CAPTION = (480, 320), 30
@@ -31,6 +33,11 @@ has fallen yet."""
 BAR_X = 20.0
 AHEAD, DOWN = math.radians(28.0), math.radians(11.0)
 """A solo athlete is seen from this far ahead of its side, and from this far above."""
+_LANE = tuple((hurdling.FIRST_X + k * hurdling.GAP, 0.0, hurdling.RACE_HEIGHT) for k in range(2))
+_STARTS = {
+    "hurdling": Stand(azimuth=14.0, pitch=10.0, anchors=_LANE),
+}
+"""Where a start is seen from that would otherwise show an athlete and nothing else."""
 TRIALS = 4
 """Episodes of a policy from which the best is taken."""
 
@@ -120,9 +127,7 @@ def contact_sheet(
     for i, (name, episode) in enumerate(episodes.items()):
         player = Player(episode)
         frame = highlight(player)
-        view, marks = shots(player, [frame], *tile)[0], ground_marks(episode.scene)
-        if stand(player.scene) is None:
-            view = replace(view, azimuth=view.azimuth - AHEAD, pitch=DOWN, height=1.1 * view.height)
+        view, marks = _view(player, frame, tile), ground_marks(episode.scene)
         image = picture(player, frame, view, marks)
         labels(ImageDraw.Draw(image), view, marks)
         at = (i % columns * tile[0], i // columns * high)
@@ -136,6 +141,17 @@ def contact_sheet(
     buffer = io.BytesIO()
     sheet.save(buffer, "PNG", optimize=True)
     return write_bytes(path, buffer.getvalue())
+
+
+def _view(player: Player, frame: int, tile: tuple[int, int]) -> View:
+    """As on a sheet, but solo athletes are seen half from ahead, and at a start from behind."""
+    start = _STARTS.get(player.scene.name)
+    if start is not None and len(player) <= HELD_STEPS:
+        return shot(player, frame, *tile, own=start)
+    view = shots(player, [frame], *tile)[0]
+    if stand(player.scene) is None:
+        view = replace(view, azimuth=view.azimuth - AHEAD, pitch=DOWN, height=1.1 * view.height)
+    return view
 
 
 def render_all(path: str | Path, seed: int = 0) -> Path:

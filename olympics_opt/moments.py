@@ -64,7 +64,8 @@ def _struck(player: Player, name: str) -> list[Event]:
         return []
     move = np.diff(path, axis=0) / dt  # (T - 1, 3) mean velocity between frames
     fall = np.array([0.0, 0.0, -9.81 * dt])
-    jump = np.linalg.norm(np.diff(move, axis=0) - fall, axis=1)  # at frames 1 .. T - 2
+    blow = np.diff(move, axis=0) - fall  # at frames 1 .. T - 2
+    jump = np.linalg.norm(blow, axis=1)
     found: list[Event] = []
     qvel = getattr(player.episode, "qvel", None)
     if qvel is not None and np.size(qvel):
@@ -86,7 +87,7 @@ def _struck(player: Player, name: str) -> list[Event]:
         frame = int(i) + 1
         if frame - last < 2:
             continue
-        touched = _touched(player, name, frame)
+        touched = _touched(player, name, frame, blow[i])
         weight = (2.0 if touched not in ("", GROUND) else 1.0) * min(1.0, jump[i] / 6.0)
         if touched or jump[i] > 2 * JUMP:
             found.append(Event(frame, f"{name}: {touched or '?'}", 1.0 + weight))
@@ -94,15 +95,18 @@ def _struck(player: Player, name: str) -> list[Event]:
     return found
 
 
-def _touched(player: Player, name: str, frame: int) -> str:
-    """Link or object nearest to a thing around a frame; empty where nothing is near."""
-    best, word = NEAR, ""
-    for f in (frame - 1, frame, frame + 1):
-        if 0 <= f < len(player):
-            away, nearest = _nearest(player, name, f)
-            if away < best:
-                best, word = away, nearest
-    return word
+def _touched(player: Player, name: str, frame: int, blow: np.ndarray) -> str:
+    """What struck a thing around a frame, which changed its velocity by ``blow`` (3,): the nearest
+    link or object; empty where nothing is near. A ball on the ground that goes off along it was
+    struck by what else is near."""
+    around = [f for f in (frame - 1, frame, frame + 1) if 0 <= f < len(player)]
+    others = [owner for owner in set(_owners(player).values()) if owner not in (name, GROUND)]
+    ground = min(_nearest(player, name, f, (GROUND,))[0] for f in around)
+    away, other = min(_nearest(player, name, f, others) for f in around)
+    upward = blow[2] > 2.0 * float(np.hypot(blow[0], blow[1]))
+    if other and away < NEAR and not (upward and ground < NEAR):
+        return other
+    return GROUND if ground < NEAR else ""
 
 
 def _nearest(
@@ -110,7 +114,7 @@ def _nearest(
 ) -> tuple[float, str]:
     """Distance (m, at most ``far``) from a thing to the nearest other shape, and whose it is.
 
-    ``only``: names of links, without which any shape counts.
+    ``only``: names of links or objects, or the ground; without them any shape counts.
     """
     data, model = player.show(frame), player.model
     ids = _owners(player)
@@ -129,7 +133,7 @@ def _nearest(
             away = mujoco.mj_geomDistance(model, data, b, g, best, None)
             if away < best:
                 best, word = away, owner
-    if player.ground is not None and only is None:
+    if player.ground is not None and (only is None or GROUND in only):
         x, y, z = at
         high = z - float(player.ground.height(x, y)) - float(model.geom_rbound[own[0]])
         if high < best:

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 
 from olympics_opt.scenery.paint import PAINT, Mark, across, along, rectangle, slanted
+from sports import hurdling as rules
 from sports.scene import Scene
 
 TRACK, SAND, SAND_LINE, MAT, TURF = "#c9806a", "#e6d3a6", "#cdb684", "#7fa3c4", "#a9c99a"
 LINE = 0.05
 """Width of a track's lines (m)."""
 
-HURDLES_LANE, FINISH_X, FIRST_HURDLE, HURDLE_GAP = 0.8, 110.0, 13.72, 9.14
 JAVELIN_LINE, JAVELIN_HALF_WIDTH = 2.0, 2.0
 """x of the foul line and half the runway's width (m)."""
 ARC_RADIUS, SECTOR_ANGLE = 8.0, math.radians(28.96)
@@ -49,19 +49,19 @@ def high_jump(scene: Scene) -> list[Mark]:
 
 def hurdling(scene: Scene) -> list[Mark]:
     """One lane with the start, the finish, and a tick at each hurdle and every ten metres."""
-    half = HURDLES_LANE
+    half, finish = rules.LANE_HALF_WIDTH, rules.FINISH_X
     marks = [
-        rectangle(-3.0, FINISH_X + 15.0, -half - 0.6, half + 0.6, TRACK),
-        along(-half - LINE / 2, -3.0, FINISH_X + 15.0, LINE),
-        along(half + LINE / 2, -3.0, FINISH_X + 15.0, LINE),
-        across(-LINE / 2, -half, half, LINE, label="start"),
+        rectangle(-3.0, finish + 20.0, -half - 0.6, half + 0.6, TRACK),
+        along(-half - LINE / 2, -3.0, finish + 20.0, LINE),
+        along(half + LINE / 2, -3.0, finish + 20.0, LINE),
+        across(-LINE / 2, -half, half, LINE),
         # A race ends at the edge of the finishing line that is nearer to the start.
-        across(FINISH_X + LINE / 2, -half, half, LINE, label="finish"),
+        across(finish + LINE / 2, -half, half, LINE),
     ]
-    for x in range(10, int(FINISH_X), 10):
+    for x in range(10, int(finish), 10):
         marks.append(across(float(x), -half - 0.25, -half, 0.03, label=f"{x} m"))
-    for k in range(10):
-        x = FIRST_HURDLE + HURDLE_GAP * k
+    for k in range(rules.HURDLES):
+        x = rules.FIRST_X + rules.GAP * k
         marks += [across(x, -half - 0.5, -half - 0.25, 0.05, "#3f6fa5")]
     return marks
 
