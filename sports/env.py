@@ -266,9 +266,12 @@ class Env:
         return proprioception(view.physics, view.heading, tuple(goal.values())).nan_to_num_()
 
     def snapshot(self) -> dict[str, Tensor]:
-        """Copies of qpos, qvel, mocap_pos and ground_force, for recordings."""
+        """Copies of qpos, qvel, mocap_pos and ground_force, for recordings, and of what the task
+        shows (``shown/NAME``)."""
         physics = self.physics
+        shown = {k: self.memory[k].clone() for k in self.task.shown if k in self.memory}
         return {
+            **{f"shown/{name}": value for name, value in shown.items()},
             "qpos": physics.qpos.clone(),
             "qvel": physics.qvel.clone(),
             "mocap_pos": physics.mocap_pos.clone(),
