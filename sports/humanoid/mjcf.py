@@ -19,7 +19,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from sports.humanoid.body import Body, Shape
+from sports.humanoid.body import Body, Shape, is_finger
 from sports.scene import GROUND, Scene, SceneObject, humanoid_scene
 
 _KIND = {
@@ -40,9 +40,9 @@ CONTACT_SOLIMP = (CONTACT_IMPEDANCE, CONTACT_IMPEDANCE, 0.001, 0.5, 2.0)
 HOLD_SOLREF, HOLD_IMPEDANCE = (1.0 / 120.0, 1.0), 0.99
 """Contacts of athletes with what they can hold: the least time constant at 1/240 s, critical
 damping, and so little yielding that a held javelin creeps by 0.2 mm/s."""
-# Collision classes: objects, the ground plane, athletes. What can be held has every shape twice:
-# one that meets athletes, one that meets the rest.
-_SOLID, _GROUND, _ATHLETE, _REST = 1, 2, 4, 8
+# Collision classes: objects, the ground plane, athletes, their fingers (which meet objects only).
+# What can be held has every shape twice: one that meets athletes, one that meets the rest.
+_SOLID, _GROUND, _ATHLETE, _FINGER, _REST = 1, 2, 4, 8, 16
 
 
 def body_name(agent: int, link: str) -> str:
@@ -71,14 +71,15 @@ def _add_agent(spec: mujoco.MjSpec, scene: Scene, agent: int) -> None:
         bodies[link.name] = node
         if link.parent is None:
             node.add_freejoint(name=f"agent{agent}/root")
+        finger = is_finger(link.name)
         for k, shape in enumerate(link.shapes):
             _add_shape(
                 node,
                 shape,
                 name=f"{body_name(agent, link.name)}:{k}",
                 friction=(friction, 0.005, 0.0001),
-                contype=_ATHLETE,
-                conaffinity=_SOLID | _GROUND | _ATHLETE,
+                contype=_FINGER if finger else _ATHLETE,
+                conaffinity=_SOLID if finger else _SOLID | _GROUND | _ATHLETE,
                 condim=3,
                 solref=CONTACT_SOLREF,
                 solimp=CONTACT_SOLIMP,
@@ -127,7 +128,8 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
             fields["solref"] = obj.solref
         _add_shape(node, shape, **fields)
         if obj.holdable:
-            fields |= {"contype": 0, "conaffinity": _ATHLETE, "priority": 1, "solref": HOLD_SOLREF}
+            fields |= {"contype": 0, "conaffinity": _ATHLETE | _FINGER, "priority": 1}
+            fields["solref"] = HOLD_SOLREF
             fields["solimp"] = (HOLD_IMPEDANCE, HOLD_IMPEDANCE, 0.001, 0.5, 2.0)
             _add_shape(node, replace(shape, mass=0.0), **fields)
 
