@@ -5,11 +5,21 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from sports import high_jump, hurdling, long_jump
+from sports import high_jump, hurdling, long_jump, penalty_kick, soccer
 from sports.humanoid.body import load_body
 from sports.task import Task
 
-_TASKS: dict[str, Task] = {t.name: t for t in (high_jump.TASK, long_jump.TASK, hurdling.TASK)}
+_TASKS: dict[str, Task] = {
+    t.name: t
+    for t in (
+        high_jump.TASK,
+        long_jump.TASK,
+        hurdling.TASK,
+        penalty_kick.TASK,
+        soccer.SOCCER_1V1,
+        soccer.SOCCER_2V2,
+    )
+}
 
 
 def task_names() -> tuple[str, ...]:
