@@ -13,6 +13,7 @@ from sports import (
     hurdling,
     javelin,
     long_jump,
+    soccer,
     table_tennis,
     tennis,
 )
@@ -31,6 +32,7 @@ _ALL = (
     table_tennis.DUEL,
     fencing.TASK,
     boxing.TASK,
+    *soccer.TASKS,
 )
 _TASKS: dict[str, Task] = {task.name: task for task in _ALL}
 
