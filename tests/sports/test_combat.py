@@ -273,7 +273,8 @@ def test_who_falls_has_lost_and_the_other_is_cut_off(task, agent):
     bout.env.memory["touches"][:, agent] = 3.0
     standing = bout.step(ground={(agent, "L_Hand"): 49.0, (agent, "L_Toe"): 900.0})
     assert not standing.terminated.any()
-    assert standing.metrics["success"][0] == float(agent == 0) and standing.metrics["draw"][0] == 0.0
+    assert standing.metrics["success"][0] == float(agent == 0)
+    assert standing.metrics["draw"][0] == 0.0
     step = bout.step(ground={(agent, "L_Hand"): 51.0})
     assert step.terminated[0].tolist() == [agent == 0, agent == 1]
     assert step.metrics["success"][0] == float(agent == 1) == float(step.success[0])
