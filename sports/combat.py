@@ -140,7 +140,8 @@ def begin(view: View, weapons: tuple[Weapon, ...]) -> Memory:
 
 def advance(view: View, memory: Memory, weapons: tuple[Weapon, ...], faults: Tensor) -> Advance:
     """One control step of a bout. ``faults`` (N, A): who ended it by a fall or by leaving; such an
-    athlete has lost, or whoever leads could end the bout by lying down. Otherwise more touches win.
+    athlete has lost, or whoever leads could end the bout by lying down. Otherwise, and where both
+    did, more touches win. Metrics are those of athlete 0; success is a bout it won.
     """
     squares = squared(gaps(view, weapons))
     # The force is the largest of the step's substeps, and the weapon may be off again at its end:
@@ -172,7 +173,7 @@ def advance(view: View, memory: Memory, weapons: tuple[Weapon, ...], faults: Ten
     margin = torch.where(lost == won, mine - theirs, won.float() - lost.float())
     win = margin > 0
     metrics = {
-        "win": win.float(),
+        "success": win.float(),
         "draw": (margin == 0).float(),
         "touches_for": mine,
         "touches_against": theirs,

@@ -120,7 +120,7 @@ TASK = Task(
     features=features,
     advance=advance,
     metrics={
-        "win": "fraction",
+        "success": "fraction",
         "draw": "fraction",
         "touches_for": "touches",
         "touches_against": "touches",
@@ -129,7 +129,7 @@ TASK = Task(
         "out": "fraction",
         "opponent_out": "fraction",
     },
-    main_metric="win",
+    main_metric="success",
     max_steps=300,
     equipment=("sword",),
     tools=("R_Hand",),

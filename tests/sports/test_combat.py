@@ -273,10 +273,11 @@ def test_who_falls_has_lost_and_the_other_is_cut_off(task, agent):
     bout.env.memory["touches"][:, agent] = 3.0
     standing = bout.step(ground={(agent, "L_Hand"): 49.0, (agent, "L_Toe"): 900.0})
     assert not standing.terminated.any()
-    assert standing.metrics["win"][0] == float(agent == 0) and standing.metrics["draw"][0] == 0.0
+    assert standing.metrics["success"][0] == float(agent == 0)
+    assert standing.metrics["draw"][0] == 0.0
     step = bout.step(ground={(agent, "L_Hand"): 51.0})
     assert step.terminated[0].tolist() == [agent == 0, agent == 1]
-    assert step.metrics["win"][0] == float(agent == 1) == float(step.success[0])
+    assert step.metrics["success"][0] == float(agent == 1) == float(step.success[0])
     assert step.metrics["fell"][0] == float(agent == 0)
     assert step.metrics["opponent_fell"][0] == float(agent == 1)
 
@@ -291,7 +292,7 @@ def test_the_environment_cuts_the_other_off(task):
     result = env.step(action)
     assert result.terminated.tolist() == [[False, False], [False, True]]
     assert result.truncated.tolist() == [[False, False], [True, False]]
-    assert result.metrics["win"].tolist() == [0.0, 1.0]
+    assert result.metrics["success"].tolist() == [0.0, 1.0]
 
 
 def test_more_touches_win_and_as_many_are_a_draw(task):
@@ -302,7 +303,7 @@ def test_more_touches_win_and_as_many_are_a_draw(task):
     bout.env.physics.ground_force[3, :, 0, 2] = 500.0  # both fall: the touches decide
     bout.env.view.clock += 1
     step = bout.env.task.advance(bout.env.view, bout.env.memory)
-    assert step.metrics["win"].tolist() == [1.0, 0.0, 0.0, 1.0]
+    assert step.metrics["success"].tolist() == [1.0, 0.0, 0.0, 1.0]
     assert step.metrics["draw"].tolist() == [0.0, 1.0, 0.0, 0.0]
     assert step.terminated.tolist() == [[False, False]] * 3 + [[True, True]]
 

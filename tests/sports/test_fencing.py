@@ -108,7 +108,7 @@ def test_who_leaves_the_piste_has_lost(agent: int, x: float, y: float, out: int)
     assert step.terminated[0].tolist() == [bool(out) and agent == 0, bool(out) and agent == 1]
     assert step.metrics["out"][0] == out * (agent == 0)
     assert step.metrics["opponent_out"][0] == out * (agent == 1)
-    assert step.metrics["win"][0] == out * (agent == 1)
+    assert step.metrics["success"][0] == out * (agent == 1)
     assert step.metrics["draw"][0] == 1 - out and step.metrics["fell"][0] == 0.0
 
 
