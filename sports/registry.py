@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from sports import high_jump, hurdling, javelin, long_jump
+from sports import free_throw, high_jump, hurdling, javelin, long_jump
 from sports.humanoid.body import load_body
 from sports.task import Task
 
-_ALL = (high_jump.TASK, long_jump.TASK, hurdling.TASK, javelin.TASK)
+_ALL = (high_jump.TASK, long_jump.TASK, hurdling.TASK, javelin.TASK, free_throw.TASK)
 _TASKS: dict[str, Task] = {t.name: t for t in _ALL}
 
 

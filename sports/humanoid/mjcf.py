@@ -135,6 +135,8 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
 def _side(scene: Scene, name: str) -> tuple[mujoco.mjtObj, str]:
     if ":" in name or name == GROUND:
         return mujoco.mjtObj.mjOBJ_GEOM, name
+    if name.endswith("/"):
+        return mujoco.mjtObj.mjOBJ_XBODY, name[:-1]
     if "/" in name:
         return mujoco.mjtObj.mjOBJ_BODY, name
     if name.startswith("agent"):
