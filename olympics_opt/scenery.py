@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sports import hurdling
+from sports import free_throw, hurdling
 from sports.scene import Scene
 
 
@@ -34,6 +34,7 @@ def _rectangle(x0: float, x1: float, y0: float, y1: float, color: str, label: st
 
 
 TRACK, PAINT, SAND, SAND_LINE, MAT = "#c9806a", "#ffffff", "#e6d3a6", "#cdb684", "#7fa3c4"
+WOOD, KEY = "#dcbc8c", "#b9775a"
 
 
 def _long_jump() -> list[Mark]:
@@ -74,7 +75,32 @@ def _hurdling() -> list[Mark]:
     return marks
 
 
-_MARKS = {"long_jump": _long_jump, "high_jump": _high_jump, "hurdling": _hurdling}
+def _frame(x0: float, x1: float, y0: float, y1: float, inside: str) -> list[Mark]:
+    """An area with a line of 5 cm within its edge."""
+    line = 0.05
+    return [
+        _rectangle(x0, x1, y0, y1, PAINT),
+        _rectangle(x0 + line, x1 - line, y0 + line, y1 - line, inside),
+    ]
+
+
+def _key(rim_x: float, side: float) -> list[Mark]:
+    """The restricted area before a basket, from the free-throw line to the end line (FIBA)."""
+    ends = sorted((rim_x - side * 4.225, rim_x + side * 1.575))
+    return _frame(ends[0], ends[1], -2.45, 2.45, KEY)
+
+
+def _free_throw() -> list[Mark]:
+    end = free_throw.RIM_X + 1.575
+    return [*_frame(end - 14.0, end, -7.5, 7.5, WOOD), *_key(free_throw.RIM_X, 1.0)]
+
+
+_MARKS = {
+    "long_jump": _long_jump,
+    "high_jump": _high_jump,
+    "hurdling": _hurdling,
+    "free_throw": _free_throw,
+}
 
 
 def ground_marks(scene: Scene) -> list[Mark]:
