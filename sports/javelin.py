@@ -37,8 +37,6 @@ REACH = 0.15
 """Palm to grip (m) beyond which the grip is lost; palm to shaft beyond which it is let go."""
 MAX_TILT = 0.5
 """rad off the attitude of the hold while held."""
-PALM = (-0.0029, -0.0537, -0.0044)
-"""Middle of the right palm in the frame of R_Wrist (m): of its box."""
 TOUCH = 1e-3
 """A support point this close to the ground (m) touches it."""
 END = JAVELIN_LENGTH / 2 - JAVELIN_RADIUS
@@ -190,8 +188,9 @@ def advance(view: View, memory: Memory) -> Advance:
 def _palm(view: View) -> Tensor:
     """(N, 3) the middle of the right palm."""
     physics = view.physics
-    wrist = physics.scene.body.link_index("R_Wrist")
-    palm = constant(PALM, physics.body_pos.device)
+    body = physics.scene.body
+    wrist = body.link_index("R_Wrist")
+    palm = constant(body.links[wrist].shapes[0].center, physics.body_pos.device)
     return physics.body_pos[:, 0, wrist] + view.rotation[:, 0, wrist] @ palm
 
 

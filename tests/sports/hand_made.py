@@ -54,17 +54,19 @@ class HandMade:
         self.env.view.clock = torch.full((self.env.num_worlds,), 5)
 
     def advance(
-        self, forces: dict[str, float] | None = None, pair: float = 0.0, velocity: float = 0.0
+        self,
+        forces: dict[str, float] | None = None,
+        pair: float | tuple[float, ...] = 0.0,
+        velocity: float = 0.0,
     ):
         """One control step that ends in the placed state, with vertical ground forces (N) by
-        link, a contact force of the first named pair, and a forward root velocity."""
+        link, contact forces of the named pairs, and a forward root velocity."""
         self.state.qvel[:, 0] = velocity
         self._apply()
         physics = self.env.physics
         for link, newtons in (forces or {}).items():
             physics.ground_force[:, 0, physics.scene.body.link_index(link), 2] = newtons
-        if physics.pair_force.shape[1]:
-            physics.pair_force[:, 0] = pair
+        physics.pair_force[:] = torch.tensor(pair)
         self.env.view.clock = self.env.view.clock + 1
         step = self.env.task.advance(self.env.view, self.env.memory)
         self.env.memory = step.memory

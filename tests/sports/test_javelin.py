@@ -1,0 +1,381 @@
+"""The javelin's rules on states made by hand, with known answers."""
+
+import math
+
+import pytest
+import torch
+
+from sports import quaternion
+from sports.env import make_env
+from sports.humanoid.hold import JAVELIN_LENGTH, JAVELIN_RADIUS
+from sports.physics import PhysicsState
+from tests.sports.hand_made import HandMade
+
+STANDING = 0.9483
+"""Root height with the soles just above the ground."""
+HALF = JAVELIN_LENGTH / 2 - JAVELIN_RADIUS
+UP = math.radians(30.0)
+FAR = (1.0, -0.6, 4.0)
+"""Out of every hand's reach."""
+HOLD, THROW, LATE = 5, 25, 60
+"""Control steps in the three stages, the last after the release must have been."""
+
+
+class Throw(HandMade):
+    """A javelin wherever a test wants it."""
+
+    def __init__(self) -> None:
+        super().__init__("javelin")
+        scene = self.env.physics.scene
+        self.q, self.v = scene.object_qpos("javelin"), scene.object_qvel("javelin")
+        self.place((0.0, 0.0, STANDING))
+
+    def javelin(self, pos, elevation=UP, velocity=(0.0, 0.0, 0.0), azimuth=0.0) -> None:
+        """Centre, elevation and azimuth of the nose (rad), velocity; no spin."""
+        yaw = torch.tensor((math.cos(azimuth / 2), 0.0, 0.0, math.sin(azimuth / 2)))
+        pitch = torch.tensor((math.cos(elevation / 2), 0.0, -math.sin(elevation / 2), 0.0))
+        self.state.qpos[:, self.q] = torch.cat((torch.tensor(pos), quaternion.multiply(yaw, pitch)))
+        self.state.qvel[:, self.v] = torch.tensor((*velocity, 0.0, 0.0, 0.0))
+
+    def palm(self) -> torch.Tensor:
+        """(3,) middle of the right palm: of its box in the body table."""
+        physics = self.env.physics
+        self._apply()
+        wrist = physics.scene.body.link_index("R_Wrist")
+        center = torch.tensor((-0.0029, -0.0537, -0.0044))
+        turned = quaternion.rotate(physics.body_quat[0, 0, wrist], center)
+        return physics.body_pos[0, 0, wrist] + turned
+
+    def at(self, clock: int) -> None:
+        """Begins anew; the next step is number ``clock``."""
+        self.begin()
+        self.env.view.clock[:] = clock - 1
+
+    def step(self, touched: float = 0.0, ground: float = 0.0, **forces: float):
+        """Ends a step with forces (N) of the athlete and of the ground on the javelin."""
+        return self.advance(forces, pair=(touched, ground))
+
+
+def ended(step) -> bool:
+    return bool(step.terminated[0, 0])
+
+
+def released(world: Throw) -> None:
+    """The javelin has left the hand, in the throwing stage."""
+    world.javelin(FAR)
+    world.at(THROW)
+    assert not ended(world.step())
+    assert world.env.memory["released"][0]
+
+
+def test_features_are_seen_from_the_athlete():
+    """An athlete who has turned by 90 degrees sees what it saw; the world's x is its right."""
+    world = Throw()
+    world.javelin((0.4, -0.5, 1.6), velocity=(3.0, 1.0, -2.0))
+    world.at(HOLD)
+    straight = {k: v.clone() for k, v in world.env.task.features(world.env.view, _m(world)).items()}
+    assert sum(v.shape[-1] for v in straight.values()) == 19
+    near = pytest.approx
+    assert straight["javelin_pos"][0, 0].tolist() == near([0.4, -0.5, 1.6 - STANDING], abs=1e-5)
+    assert straight["javelin_linvel"][0, 0].tolist() == near([3.0, 1.0, -2.0], abs=1e-5)
+    pitch = [math.cos(UP / 2), 0.0, -math.sin(UP / 2), 0.0]
+    assert straight["javelin_quat"][0, 0].tolist() == near(pitch, abs=1e-5)
+    hand = (world.palm() - torch.tensor((0.0, 0.0, STANDING))).tolist()
+    assert straight["hand"][0, 0].tolist() == near(hand, abs=1e-5)
+
+    quarter = math.cos(math.pi / 4)
+    world.state.qpos[:, 3:7] = torch.tensor((quarter, 0.0, 0.0, quarter))
+    world.state.qpos[:, :2] = torch.tensor((0.3, 0.7))
+    world.javelin((0.3 + 0.5, 0.7 + 0.4, 1.6), velocity=(-1.0, 3.0, -2.0), azimuth=math.pi / 2)
+    world._apply()
+    turned = world.env.task.features(world.env.view, _m(world))
+    for name in ("javelin_pos", "javelin_quat", "javelin_linvel", "hand"):
+        torch.testing.assert_close(turned[name], straight[name], rtol=0, atol=1e-5)
+    assert turned["root"][0, 0].tolist() == near([0.7, -0.3, 0.0], abs=1e-5)
+
+
+def _m(world: Throw):
+    return world.env.memory
+
+
+def test_rewards_of_the_three_stages():
+    world = Throw()
+    palm = world.palm()
+    grip = palm + torch.tensor((0.06, 0.0, 0.08))  # 0.1 m away
+    world.javelin(tuple(grip.tolist()), elevation=UP + 0.2)
+    world.at(17)
+    step = world.step()
+    terms = {k: float(v[0, 0]) for k, v in step.terms.items()}
+    assert terms["grab"] == pytest.approx(0.9 * math.exp(-0.01), abs=1e-5)
+    assert terms["attitude"] == pytest.approx(0.1 * math.exp(-0.04), abs=1e-4)
+    assert terms["start"] == terms["goal"] == 0.0
+    # Step 18 is 0.6 s: from here the javelin's way forward pays.
+    world.place((0.3, 0.4, STANDING))
+    world.javelin((float(grip[0]) + 0.7, -0.5, 1.6))
+    step = world.step()
+    terms = {k: float(v[0, 0]) for k, v in step.terms.items()}
+    apart = math.dist(world.palm().tolist(), (float(grip[0]) + 0.7, -0.5, 1.6))
+    assert terms["goal"] == pytest.approx(0.9 * 0.7, abs=1e-5)
+    assert terms["start"] == pytest.approx(0.05 * math.exp(-0.25), abs=1e-5)
+    assert terms["grab"] == pytest.approx(-0.05 * math.exp(-(apart**2)), abs=1e-5)
+    assert terms["attitude"] == 0.0
+    # From 1.2 s on the nose should point where the javelin flies: here 45 degrees down.
+    for clock, late in ((35, False), (36, True)):
+        world.javelin(FAR, elevation=-math.pi / 4 + 0.3)
+        world.at(clock)
+        world.javelin((2.0, -0.6, 3.0), elevation=-math.pi / 4 + 0.3, velocity=(9.0, 0.0, -9.0))
+        terms = {k: float(v[0, 0]) for k, v in world.step().terms.items()}
+        assert terms["goal"] == pytest.approx(0.9 * 1.0, abs=1e-5)
+        assert terms["attitude"] == pytest.approx(0.1 * math.exp(-0.09) * late, abs=1e-4)
+
+
+@pytest.mark.parametrize(("away", "lost"), [(0.149, False), (0.151, True)])
+def test_the_grip_must_hold_for_the_first_stage(away, lost):
+    for clock, counts in ((17, True), (18, False)):
+        world = Throw()
+        palm = world.palm()
+        along = torch.tensor((math.cos(UP), 0.0, math.sin(UP)))  # the shaft itself stays in hand
+        world.javelin(tuple((palm + away * along).tolist()))
+        world.at(clock)
+        assert ended(world.step(touched=20.0)) is (lost and counts)
+
+
+@pytest.mark.parametrize(("tilt", "lost"), [(0.49, False), (0.51, True), (-0.51, True)])
+def test_the_attitude_must_hold_for_the_first_stage(tilt, lost):
+    for clock, counts in ((17, True), (18, False)):
+        world = Throw()
+        world.javelin(tuple(world.palm().tolist()), elevation=UP + tilt)
+        world.at(clock)
+        assert ended(world.step(touched=20.0)) is (lost and counts)
+
+
+@pytest.mark.parametrize(("away", "near"), [(0.149, True), (0.151, False)])
+@pytest.mark.parametrize("part", ["middle", "tail"])
+def test_the_hand_must_be_off_the_whole_shaft_at_one_and_a_half_seconds(away, near, part):
+    for clock, counts in ((47, False), (48, True)):
+        world = Throw()
+        palm = world.palm()
+        if part == "middle":  # half a metre of shaft on, and ``away`` above the hand
+            pos = palm + torch.tensor((0.5, 0.0, away))
+        else:  # beyond the end of the tail
+            pos = palm + torch.tensor((HALF + away, 0.0, 0.0))
+        world.javelin(tuple(pos.tolist()), elevation=0.0)
+        world.at(clock)
+        step = world.step()
+        assert ended(step) is (near and counts)
+        assert bool(world.env.memory["released"][0]) is not near
+        assert not step.success[0]
+
+
+def test_what_the_athlete_still_touches_is_not_released():
+    world = Throw()
+    world.javelin(FAR)  # on the head, say
+    world.at(THROW)
+    assert not ended(world.step(touched=5.0))
+    assert not world.env.memory["released"][0]
+    assert not ended(world.step())
+    assert world.env.memory["released"][0]
+
+
+def test_nobody_catches_it_again_or_kicks_it_on():
+    """Up to 1.6 s that is the same throw; from then on any touch ends it as a failure."""
+    world = Throw()
+    released(world)
+    assert not ended(world.step(touched=5.0))
+    for clock, over in ((47, False), (48, True), (120, True)):
+        world.env.view.clock[:] = clock - 1
+        step = world.step(touched=5.0)
+        assert ended(step) is over and not step.success[0]
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "out"),
+    [(1.4, 0, 0), (2.01, 0, 1), (-1.99, 0, 0), (-2.01, 0, 1), (0, 1.99, 0), (0, 2.01, 1)]
+    + [(0, -1.99, 0), (0, -2.01, 1)],
+)
+@pytest.mark.parametrize("stage", [HOLD, THROW, LATE])
+def test_the_root_stays_within_two_metres_of_the_start(x, y, out, stage):
+    world = Throw()
+    if stage == LATE:
+        released(world)
+    world.place((x, y, 1.3))
+    world.javelin(FAR if stage == LATE else tuple(world.palm().tolist()))
+    world.env.view.clock[:] = stage - 1
+    if stage != LATE:
+        world.at(stage)
+    step = world.step(touched=0.0 if stage == LATE else 20.0)
+    assert ended(step) is bool(out)
+    assert step.metrics["foul"][0] == out
+
+
+def test_running_out_with_the_javelin_ends_the_throw():
+    """Carried beyond the line it pays the way to the line at most, and never counts."""
+    world = Throw()
+    world.place((0.0, 0.0, 1.3))
+    world.javelin(tuple(world.palm().tolist()))
+    world.at(HOLD)
+    world.env.view.clock[:] = THROW
+    paid, steps = 0.0, 0
+    for k in range(1, 40):
+        world.place((0.1 * k, 0.0, 1.3))
+        world.javelin(tuple(world.palm().tolist()))
+        step = world.step(touched=20.0)
+        paid, steps = paid + float(step.terms["goal"][0, 0]), k
+        if ended(step):
+            break
+    assert steps == 21 and paid == pytest.approx(0.9 * 2.1, abs=1e-4)
+    assert not step.success[0] and step.metrics["foul"][0] == 1.0
+
+
+def test_a_foot_beyond_the_line_is_a_foul_also_after_the_release():
+    """The right toe of the standing athlete: from the body table, hip to toe and half its length."""
+    toe = -0.0213 - 0.0168 - 0.0202 + 0.119 + 0.0158 + 0.0495
+    left = -0.026 - 0.0094 - 0.0319 + 0.1182 + 0.0256 + 0.0495
+    furthest = max(toe, left)
+    for beyond, foul in ((-0.01, False), (0.01, True)):
+        world = Throw()
+        released(world)
+        world.place((2.0 - furthest + beyond, 0.0, STANDING))
+        world.drop_to_ground("R_Toe")
+        step = world.step(R_Toe=300.0, L_Toe=300.0)
+        assert ended(step) is foul and step.metrics["foul"][0] == float(foul)
+        # Above the ground it is none.
+        world = Throw()
+        released(world)
+        world.place((2.0 - furthest + beyond, 0.0, STANDING + 0.1))
+        assert not ended(world.step())
+
+
+def test_throwing_oneself_over_the_line_is_a_foul():
+    """The root is behind the line, the hands of the falling athlete are not."""
+    world = Throw()
+    released(world)
+    lying = math.cos(math.pi / 4)
+    world.state.qpos[:, 3:7] = torch.tensor((lying, 0.0, lying, 0.0))  # face down, head to +x
+    world.place((1.7, 0.0, 0.12))
+    step = world.step(L_Wrist=200.0, Chest=400.0)
+    assert ended(step) and step.metrics["foul"][0] == 1.0 and not step.success[0]
+    # The same fall at the start, after the release, is allowed.
+    world = Throw()
+    released(world)
+    world.state.qpos[:, 3:7] = torch.tensor((lying, 0.0, lying, 0.0))
+    world.place((0.0, 0.0, 0.12))
+    assert not ended(world.step(L_Wrist=200.0, Chest=400.0))
+
+
+def test_a_fall_before_the_release_ends_the_throw():
+    world = Throw()
+    world.javelin(tuple(world.palm().tolist()))
+    world.at(THROW)
+    assert not ended(world.step(touched=20.0, L_Wrist=49.0))
+    assert ended(world.step(touched=20.0, L_Wrist=51.0))
+
+
+def flight(elevation, height, velocity, x=20.0):
+    """A released javelin comes down: the last step's rules."""
+    world = Throw()
+    released(world)
+    world.javelin((x, 0.0, height), elevation=elevation, velocity=velocity)
+    world.env.view.clock[:] = LATE
+    assert not ended(world.step())
+    world.javelin((x + 0.4, 0.0, 0.3), elevation=elevation, velocity=(1.0, 0.0, 0.5))
+    return world.step(ground=40.0)
+
+
+@pytest.mark.parametrize(("elevation", "tip"), [(-0.5, True), (0.5, False)])
+def test_the_distance_is_where_the_first_end_meets_the_ground(elevation, tip):
+    """The parabola of that end, whatever the javelin does after it."""
+    velocity, height = (20.0, 0.0, -12.0), 0.3 + HALF * math.sin(0.5)
+    step = flight(elevation, height, velocity)
+    drop = height - HALF * math.sin(0.5) - JAVELIN_RADIUS
+    g = 9.81
+    time = (velocity[2] + math.sqrt(velocity[2] ** 2 + 2 * g * drop)) / g
+    reach = HALF * math.cos(0.5) * (1 if tip else -1)
+    assert ended(step) and step.success[0]
+    expected = 20.0 + reach + velocity[0] * time - 2.0
+    assert step.metrics["distance"][0] == pytest.approx(expected, abs=1e-3)
+    assert step.metrics["tip_first"][0] == float(tip)
+    assert step.metrics["success"][0] == 1.0
+
+
+@pytest.mark.parametrize(("x", "counts"), [(1.9, False), (2.1, True), (-5.0, False)])
+def test_a_javelin_that_comes_down_behind_the_line_does_not_count(x, counts):
+    nose = HALF * math.cos(0.5)
+    step = flight(-0.5, HALF * math.sin(0.5) + JAVELIN_RADIUS + 1e-4, (0.0, 0.0, -5.0), x - nose)
+    assert ended(step) and bool(step.success[0]) is counts
+    assert math.isnan(step.metrics["distance"][0]) is not counts
+    if counts:
+        assert step.metrics["distance"][0] == pytest.approx(0.1, abs=1e-3)
+
+
+def test_resting_it_on_the_ground_is_no_throw():
+    """A held javelin whose nose reaches the ground beyond the line, and one laid down."""
+    world = Throw()
+    world.place((1.0, 0.0, STANDING))
+    world.javelin((1.2, -0.5, 0.5), elevation=-0.3)  # the nose is at x = 2.5
+    world.at(THROW)
+    step = world.step(touched=10.0, ground=5.0)
+    assert ended(step) and not step.success[0]
+    assert math.isnan(step.metrics["distance"][0])
+    # Let go of and on the ground within one step: nobody saw it fly.
+    world = Throw()
+    world.javelin((1.2, -0.5, 0.05), elevation=0.0)
+    world.at(THROW)
+    step = world.step(ground=5.0)
+    assert ended(step) and not step.success[0]
+
+
+def test_the_release_speed_is_that_of_the_release():
+    world = Throw()
+    world.javelin(tuple(world.palm().tolist()))
+    world.at(THROW)
+    world.step(touched=20.0)
+    world.javelin(FAR, velocity=(12.0, 0.0, 9.0))
+    world.step()
+    world.javelin((20.0, 0.0, 1.0), elevation=-0.5, velocity=(12.0, 0.0, -14.0))
+    world.env.view.clock[:] = LATE
+    world.step()
+    world.javelin((20.3, 0.0, 0.5), elevation=-0.5, velocity=(1.0, 0.0, 0.0))
+    step = world.step(ground=40.0)
+    assert step.success[0]
+    assert step.metrics["release_speed"][0] == pytest.approx(15.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "drake"])
+def test_a_flying_javelin_is_measured_where_its_tail_lands(engine):
+    """Thrown by hand in mid-episode and left to the engine: without spin it keeps its attitude,
+    nose up, so that the tail follows a parabola to the ground."""
+    env = make_env("javelin", engine=engine, num_worlds=1, training=False)
+    scene, physics = env.physics.scene, env.physics
+    slot, speed = scene.object_qpos("javelin"), scene.object_qvel("javelin")
+    velocity, height = (11.0, 0.0, 6.0), 2.6
+    qpos, qvel = physics.qpos.clone(), torch.zeros_like(physics.qvel)
+    quat = (math.cos(UP / 2), 0.0, -math.sin(UP / 2), 0.0)
+    qpos[:, slot] = torch.tensor((1.0, -0.6, height, *quat))
+    qvel[:, speed] = torch.tensor((*velocity, 0.0, 0.0, 0.0))
+    physics.reset(torch.ones(1, dtype=torch.bool), PhysicsState(qpos, qvel, physics.mocap_pos))
+    env.view.refresh()
+    env.memory = env.task.begin(env.view, {})
+    env.view.clock[:] = THROW
+    for _ in range(80):
+        result = env.step(torch.zeros(1, 1, env.action_size))
+        if result.ended[0]:
+            break
+    drop = height - HALF * math.sin(UP) - JAVELIN_RADIUS
+    time = (velocity[2] + math.sqrt(velocity[2] ** 2 + 2 * 9.81 * drop)) / 9.81
+    expected = 1.0 - HALF * math.cos(UP) + velocity[0] * time - 2.0
+    assert result.terminated[0, 0] and result.metrics["success"][0] == 1.0
+    assert result.metrics["distance"][0] == pytest.approx(expected, abs=0.05)
+    assert result.metrics["tip_first"][0] == 0.0
+    env.close()
+
+
+@pytest.mark.parametrize("strength", ["paper", "human"])
+def test_action_zero_holds_the_javelin_until_it_should_have_been_thrown(strength):
+    env = make_env("javelin", num_worlds=4, seed=1, strength=strength)
+    for step in range(1, 49):
+        result = env.step(torch.zeros(4, 1, env.action_size))
+        assert result.terminated.all() == (step == 48), step
+        if step < 18:
+            assert (result.reward > 0.98).all()
+    env.close()
