@@ -8,6 +8,7 @@ from typing import Any
 from sports import (
     boxing,
     fencing,
+    free_throw,
     golf,
     high_jump,
     hurdling,
@@ -33,6 +34,7 @@ _ALL = (
     fencing.TASK,
     boxing.TASK,
     *soccer.TASKS,
+    free_throw.TASK,
 )
 _TASKS: dict[str, Task] = {task.name: task for task in _ALL}
 

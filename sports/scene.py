@@ -153,8 +153,9 @@ class Scene:
     objects: tuple[SceneObject, ...] = ()
     contact_pairs: tuple[tuple[str, str], ...] = ()
     """Pairs reported in ``Physics.pair_force``; each side is ``"agent0"`` (all its links), a
-    link ``"agent0/L_Hand"``, one of its shapes ``"agent0/L_Hand:1"``, an object's name, or (the
-    second side) ``"ground"``."""
+    link ``"agent0/L_Hand"``, one of its shapes ``"agent0/L_Hand:1"``, a link and all beyond it
+    ``"agent0/L_Wrist/"`` (a hand with its fingers), an object's name, or (the second side)
+    ``"ground"``."""
     link_contacts: bool = False
     """Whether ``Physics.link_force`` is wanted."""
     surfaces: tuple[Surface, ...] = ()

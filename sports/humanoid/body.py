@@ -139,6 +139,16 @@ class Body:
         index = {name: i for i, name in enumerate(self.link_names)}
         return np.array([-1 if link.parent is None else index[link.parent] for link in self.links])
 
+    def subtree(self, name: str) -> tuple[str, ...]:
+        """A link and all beyond it, as a hand with its fingers. Raises KeyError naming the link."""
+        first = self.link_index(name)
+        beyond = [name]
+        for link in self.links[first + 1 :]:
+            if link.parent not in beyond:
+                break
+            beyond.append(link.name)
+        return tuple(beyond)
+
     def array(self, field: str) -> np.ndarray:
         """(num_dofs,) of a :class:`Dof` field: kp, kd, effort, lower, upper, armature."""
         return np.array([getattr(dof, field) for dof in self.dofs], dtype=float)

@@ -50,7 +50,7 @@ damping, and so little yielding that a held javelin creeps by 0.2 mm/s."""
 BOUNCE_STIFFNESS, BOUNCE_IMPEDANCE = 144.0, 0.998
 """Of a ball's contacts: acceleration per depth (1/s^2) and impedance. It lies 0.1 mm deep; at
 1/120 s one that arrives at 30 m/s, up to 25 cm deep when it is seen, gains 1 % from the spring."""
-# Collision classes: everything solid, the ground plane, athletes alone, other objects alone, fingers
+# Collision classes: all that is solid, the ground plane, athletes, other objects, fingers
 # (which meet objects only). What can be held has every shape twice: one for athletes, one for the
 # rest.
 _SOLID, _GROUND, _ATHLETE, _OBJECT, _FINGER = 1, 2, 4, 8, 16
@@ -177,6 +177,8 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject, timestep: float) -> None:
 def _side(scene: Scene, name: str) -> tuple[mujoco.mjtObj, str]:
     if ":" in name or name == GROUND:
         return mujoco.mjtObj.mjOBJ_GEOM, name
+    if name.endswith("/"):
+        return mujoco.mjtObj.mjOBJ_XBODY, name[:-1]
     if "/" in name:
         return mujoco.mjtObj.mjOBJ_BODY, name
     if name.startswith("agent"):

@@ -331,6 +331,9 @@ class DrakePhysics:
                     # A shape of its own gets a number that no body has.
                     names[f"{name}:{k}"] = [-1 - len(self._shape_of)]
                     self._shape_of[shape] = names[f"{name}:{k}"][0]
+            for link in self.scene.body.link_names:
+                beyond = self.scene.body.subtree(link)
+                names[f"agent{a}/{link}/"] = [names[f"agent{a}/{b}"][0] for b in beyond]
         for obj in [*self._free, *self._fixtures]:
             names[obj.name] = [int(obj.rigid.index())]
         self._pairs_of: dict[tuple[int, int], list[tuple[int, float]]] = {}

@@ -278,6 +278,10 @@ def _contact_tables(
             one, whole = pair[side], f"{pair[side]}/"
             if ":" in one or one == GROUND:
                 table[:, p] = [geom == one for geom in geoms]
+            elif one.endswith("/"):
+                agent, link = one[:-1].split("/")
+                beyond = {f"{agent}/{name}" for name in scene.body.subtree(link)}
+                table[:, p] = [n in beyond for n in names]
             else:
                 table[:, p] = [n == one or n.startswith(whole) for n in names]
         return table
