@@ -14,6 +14,7 @@ from sports import (
     hurdling,
     javelin,
     long_jump,
+    penalty_kick,
     soccer,
     table_tennis,
     tennis,
@@ -33,7 +34,9 @@ _ALL = (
     table_tennis.DUEL,
     fencing.TASK,
     boxing.TASK,
-    *soccer.TASKS,
+    penalty_kick.TASK,
+    soccer.SOCCER_1V1,
+    soccer.SOCCER_2V2,
     free_throw.TASK,
 )
 _TASKS: dict[str, Task] = {task.name: task for task in _ALL}
