@@ -61,6 +61,7 @@ class Law:
             pose[..., 3] = 1.0
             pose[..., 0] = 1e3  # out of the way
         self.law = for_cpu()
+        assert scene.ball is not None and scene.ball.law is not None
         self.ball = ball_of(scene.ball.law)
 
     @property

@@ -202,9 +202,10 @@ def test_paths_bounce_where_the_ball_does():
     alone.pos[:] = rng.normal(size=(n, 3)) * 0.2 + (0.0, 0.0, 1.5)
     alone.linvel[:] = rng.normal(size=(n, 3)) * (8.0, 3.0, 2.0)
     alone.angvel[:] = rng.normal(size=(n, 3)) * 100.0
-    state = (torch.tensor(x, dtype=torch.float32) for x in (alone.pos, alone.linvel, alone.angvel))
+    start = np.stack((alone.pos, alone.linvel, alone.angvel))
+    pos, linvel, angvel = torch.tensor(start, dtype=torch.float32)
     moments = [0.1 * k for k in range(1, 16)]
-    flown = ball.path("tennis", *state, moments, ground=0.0).numpy()
+    flown = ball.path("tennis", pos, linvel, angvel, moments, ground=0.0).numpy()
     for k in range(len(moments)):
         for _ in range(24):
             alone.step(1 / 240)
