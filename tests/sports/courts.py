@@ -6,6 +6,8 @@ import dataclasses
 import math
 
 import numpy as np
+import pytest
+import torch
 
 from sports.ball import ball_of
 from sports.ball_law.compiled import for_cpu
@@ -13,6 +15,7 @@ from sports.ball_law.play import ANGVEL, ATTITUDE, LINVEL, POS
 from sports.humanoid import load_body
 from sports.humanoid.body import Shape
 from sports.humanoid.mjcf import build_model
+from sports.physics import make_physics
 from sports.physics.game import build_game
 from sports.scene import Scene, SceneObject, Start, Surface
 
@@ -87,3 +90,27 @@ class Law:
         for w in range(self.n):
             self.law.play(self.game, w, dt)
         self.game.before[:] = self.game.after
+
+
+def engine(name, scene, n, **options):
+    if name == "warp":
+        pytest.importorskip("mujoco_warp")
+        options["device"] = "cpu"
+    if name == "mujoco":
+        options["threads"] = 2
+    return make_physics(name, scene, n, **options)
+
+
+def everyone(n):
+    return torch.ones(n, dtype=torch.bool)
+
+
+def in_front_of_the_racket(physics, state, away):
+    """World positions (N, 3) at a distance along +x of the middle of the racket's face, which the
+    wrist has turned to x; ``state`` is put into ``physics``."""
+    scene = physics.scene
+    state.qpos[:, 7 + scene.body.dof_index("R_Wrist_y")] = math.pi / 2
+    physics.reset(everyone(physics.num_worlds), state)
+    link = scene.body.link_index("R_Wrist")
+    face = physics.body_pos[:, 0, link] + physics.body_rot[:, 0, link] @ torch.tensor(RACKET.center)
+    return face + torch.tensor((away, 0.0, 0.0))

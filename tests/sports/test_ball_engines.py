@@ -18,21 +18,24 @@ from sports.ball_law.play import STATE_NUMBERS
 from sports.humanoid import load_body
 from sports.humanoid.body import Shape
 from sports.humanoid.mjcf import build_model
-from sports.physics import Geometry, PhysicsState, default_state, make_physics
+from sports.physics import Geometry, PhysicsState, default_state
 from sports.physics.variation import Variation, draw
 from sports.scene import Scene, SceneObject, Start
-from tests.sports.courts import CLUB, COURT, NET, RACKET, TABLE, WAVES, Law, court
+from tests.sports.courts import (
+    CLUB,
+    COURT,
+    NET,
+    RACKET,
+    TABLE,
+    WAVES,
+    Law,
+    court,
+    engine,
+    everyone,
+    in_front_of_the_racket,
+)
 
 ENGINES = ("mujoco", "warp", "drake")
-
-
-def engine(name, scene, n, **options):
-    if name == "warp":
-        pytest.importorskip("mujoco_warp")
-        options["device"] = "cpu"
-    if name == "mujoco":
-        options["threads"] = 2
-    return make_physics(name, scene, n, **options)
 
 
 def place(state, scene, pos, linvel, angvel=(0.0, 0.0, 0.0)):
@@ -40,21 +43,6 @@ def place(state, scene, pos, linvel, angvel=(0.0, 0.0, 0.0)):
     q, v = scene.object_qpos("ball"), scene.object_qvel("ball")
     state.qpos[:, q] = torch.cat((torch.as_tensor(pos), torch.tensor((1.0, 0.0, 0.0, 0.0)))).float()
     state.qvel[:, v] = torch.cat((torch.as_tensor(linvel), torch.as_tensor(angvel))).float()
-
-
-def everyone(n):
-    return torch.ones(n, dtype=torch.bool)
-
-
-def in_front_of_the_racket(physics, state, away):
-    """World positions (N, 3) at a distance along +x of the middle of the racket's face, which the
-    wrist has turned to x; ``state`` is put into ``physics``."""
-    scene = physics.scene
-    state.qpos[:, 7 + scene.body.dof_index("R_Wrist_y")] = math.pi / 2
-    physics.reset(everyone(physics.num_worlds), state)
-    link = scene.body.link_index("R_Wrist")
-    face = physics.body_pos[:, 0, link] + physics.body_rot[:, 0, link] @ torch.tensor(RACKET.center)
-    return face + torch.tensor((away, 0.0, 0.0))
 
 
 def test_a_shot_is_the_same_in_all_engines():
