@@ -33,6 +33,7 @@ from sports.ball_law.flight import (
     SHELL,
     Cube,
     Matrix,
+    Quat,
     Row,
     Vector,
     add,
@@ -212,6 +213,16 @@ def note(game: Game, w: int, i: int, time: float, p: Vector) -> None:
             game.hit_pos[w, i, k] = p[k]
 
 
+def spun(own: Quat, spin: Vector, h: float) -> Quat:
+    """An attitude after a time of turning at a spin."""
+    rate = length(spin)
+    if rate < STILL:
+        return own
+    half = 0.5 * rate * h
+    s = math.sin(half) / rate
+    return product(quat(math.cos(half), s * spin[0], s * spin[1], s * spin[2]), own)
+
+
 def play(game: Game, w: int, dt: float) -> None:
     """A substep of the ball of world ``w``, in which the tools go from ``game.before`` to
     ``game.after``. ``dt`` 0: nothing happens."""
@@ -223,7 +234,7 @@ def play(game: Game, w: int, dt: float) -> None:
     p, v = row(game.state, w, POS), row(game.state, w, LINVEL)
     spin = row(game.state, w, ANGVEL)
     rests = int(lies(ball, surfaces, before, after, w, a, b, p, v, spin))
-    still = vec(0.0, 0.0, 0.0)
+    still, own = vec(0.0, 0.0, 0.0), attitude(game.state, w, ATTITUDE)
     left, held = float(dt), int(0)
     for _ in range(IMPACTS):
         if left <= LITTLE * dt:
@@ -263,7 +274,7 @@ def play(game: Game, w: int, dt: float) -> None:
         part = first * left
         if which != -1 and rests == 0:
             q, u = fly(p, v, spin, part, ball)
-        p, v = q, u
+        p, v, own = q, u, spun(own, spin, part)
         left = left - part
         if which == -1:
             left = 0.0
@@ -328,14 +339,8 @@ def play(game: Game, w: int, dt: float) -> None:
         game.state[w, POS + k] = p[k]
         game.state[w, LINVEL + k] = v[k]
         game.state[w, ANGVEL + k] = spin[k]
-    rate = length(spin)
-    if rate > STILL:
-        half = 0.5 * rate * dt
-        s = math.sin(half) / rate
-        turn = quat(math.cos(half), s * spin[0], s * spin[1], s * spin[2])
-        own = product(turn, attitude(game.state, w, ATTITUDE))
-        for k in range(4):
-            game.state[w, ATTITUDE + k] = own[k]
+    for k in range(4):
+        game.state[w, ATTITUDE + k] = own[k]
     game.clock[w] = game.clock[w] + dt
 
 

@@ -465,8 +465,10 @@ def keep(
     moment = add(cross(arm, force), combine(axes, local))
     size = abs(force[0]) + abs(force[1]) + abs(force[2])
     size += abs(local[0]) + abs(local[1]) + abs(local[2])
+    # Its arm is that of the beginning of the step: the momentum about any point is then right.
     push = (applied[0], applied[1], applied[2])
-    moment = add(moment, subtract((applied[3], applied[4], applied[5]), cross(com, push)))
+    start = subtract(com, times(kept.timestep[w], velocity)) if current else com
+    moment = add(moment, subtract((applied[3], applied[4], applied[5]), cross(start, push)))
     force = add(force, push)
     force = (force[0], force[1], force[2] + kept.weight)
     if current:

@@ -189,7 +189,8 @@ def _keep_momentum(
     flying = wp.length(force) + wp.length(local) < wp.static(NO_FORCE)
     push = wp.vec3(applied[w, a, 0], applied[w, a, 1], applied[w, a, 2])
     moment = wp.vec3(applied[w, a, 3], applied[w, a, 4], applied[w, a, 5])
-    moment += turn @ local + wp.cross(arm, force) - wp.cross(center, push)
+    start = center - (float(current) * h / mass) * linear
+    moment += turn @ local + wp.cross(arm, force) - wp.cross(start, push)
     impulse_l = h * moment
     impulse_p = h * (force + push + wp.vec3(0.0, 0.0, wp.static(-GRAVITY) * mass))
 
