@@ -7,7 +7,9 @@ again. A stroke is a foul if the same side hit the ball last, if it meets the ba
 or, where volleys are not allowed, before the ball has bounced. A point is also lost by a side whose
 athlete falls, crosses the net or is met by the ball, and when the ball leaves the space of play: by
 the receiver after a good bounce, else by the side that hit it. Source: ITF rules of tennis 12, 24
-and 25; ITTF laws of table tennis 2.7 and 2.10. Let balls are played on.
+and 25; ITTF laws of table tennis 2.7 and 2.10. Let balls are played on. Two impacts on a racket
+within a control step (33 ms) are one stroke, as the rules have it of a ball hit twice in one swing;
+a contact in a later step is a second one.
 
 Sides are +1 (the half x > 0, agent 0) and -1 (agent 1, or the machine of the tasks with one
 athlete). Within a control step impacts are taken in the order of their times. World frame, m, s.
@@ -153,8 +155,8 @@ def play(
     hitter = torch.where(swung, ends[when.masked_fill(~struck, -1.0).argmax(-1)], hitter)
     bounced = bounced & ~swung
 
-    # Bounces after the stroke. Where there was one before it too, this one's place is unknown, but
-    # within a step of the stroke and so on the striker's own side.
+    # Bounces after the stroke. Where there was one before it too, this one's place is not known,
+    # but so near to the stroke that it is on the striker's own side.
     after = touch.bounces > before
     good = after & ~early & inside & (spot_x * hitter < 0)
     rest = (after & ~good).float() - (good & (touch.bounces > before + 1)).float()

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import torch
 
-from sports import rackets
+from sports import rackets, stroke
 from sports.humanoid.body import Body, Shape
 from sports.physics.base import PhysicsState
 from sports.rackets import NET_RESTITUTION, Feed, Game, Serve
@@ -140,13 +140,13 @@ def features(view: View, memory: Memory) -> dict[str, torch.Tensor]:
 
 def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
-    stroke = rackets.judge(GAME, view, memory)
-    worth = 1.0 + (-stroke.miss).exp() + stroke.returns
+    now = stroke.judge(GAME, view, memory)
+    worth = 1.0 + (-now.miss).exp() + now.returns
     terms = {
-        "approach": (-SHARPNESS * stroke.racket_distance).exp() * stroke.reaching,
-        "landing": worth * stroke.promising,
+        "approach": (-SHARPNESS * now.racket_distance).exp() * now.reaching,
+        "landing": worth * now.promising,
     }
-    return rackets.conclude(GAME, view, memory, stroke, terms)
+    return stroke.conclude(GAME, view, memory, now, terms)
 
 
 def scene_1v1(config: TableTennis, body: Body) -> Scene:

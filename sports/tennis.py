@@ -22,7 +22,7 @@ from typing import Literal
 
 import torch
 
-from sports import rackets
+from sports import rackets, stroke
 from sports.humanoid.body import Body, Shape
 from sports.physics.base import PhysicsState
 from sports.rackets import NET_RESTITUTION, Feed, Game, Serve
@@ -159,13 +159,13 @@ def features(view: View, memory: Memory) -> dict[str, torch.Tensor]:
 def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
     rules = game(view.config)
-    stroke = rackets.judge(rules, view, memory)
+    now = stroke.judge(rules, view, memory)
     terms = {
-        "approach": (-stroke.racket_distance).exp() * stroke.reaching,
-        "landing": (1.0 + (-stroke.miss).exp()) * stroke.promising,
-        "bounce": stroke.landed.float(),
+        "approach": (-now.racket_distance).exp() * now.reaching,
+        "landing": (1.0 + (-now.miss).exp()) * now.promising,
+        "bounce": now.landed.float(),
     }
-    return rackets.conclude(rules, view, memory, stroke, terms)
+    return stroke.conclude(rules, view, memory, now, terms)
 
 
 def scene_1v1(config: Tennis, body: Body) -> Scene:

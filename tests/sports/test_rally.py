@@ -12,9 +12,10 @@ import torch
 from sports import table_tennis, tennis
 from sports.humanoid import load_body
 from sports.physics import Geometry, make_physics
-from sports.rackets import BODY_DISTANCE, HAND
+from sports.rackets import HAND
 from sports.rally import Court, Touches, met, play
 from sports.scene import humanoid_scene
+from sports.stroke import BODY_DISTANCE
 
 TENNIS, TABLE = tennis.GAME.court, table_tennis.GAME.court
 NOWHERE = (0.0, 0.0, 0.0)
