@@ -45,7 +45,7 @@ class Stroke:
 def judge(game: Game, view: View, memory: Memory) -> Stroke:
     """Applies the rules to the last control step and looks ahead."""
     physics = view.physics
-    ball = physics.object_pos[:, 0]
+    ball, linvel = physics.object_pos[:, 0], physics.object_linvel[:, 0]
     racket = racket_pos(game, view)
     touch = touches(physics, 0)
     sides = constant(SIDES, ball.device)[: racket.shape[1]]
@@ -54,7 +54,8 @@ def judge(game: Game, view: View, memory: Memory) -> Stroke:
     bumped = met(view, way, BODY_DISTANCE, HAND)
     trespassed = view.root_pos[..., 0] * sides < 0
     late = bumped | trespassed | view.fallen()
-    point = play(game.court, memory["hitter"], memory["bounced"], touch, ball, late)
+    before = memory["hitter"], memory["bounced"]
+    point = play(game.court, *before, touch, ball, linvel, late)
 
     own = point.hitter[:, None] == sides
     has_struck = (memory["strokes"] + point.struck) > 0  # a feed is nobody's stroke

@@ -4,7 +4,7 @@ The net is the plane x = 0. The athlete of ``tennis`` stands at (13, 0) facing -
 launches from x = -12.5, again as soon as a return has bounced and gone; the first point lost ends
 the episode. In ``tennis_1v1`` agent 0 stands there and agent 1 at (-13, 0); the ball is let go over
 the net towards one of them, and the episode is one point. Rules: ``sports/rally.py``. Source:
-SMPLOlympics section 4 for goal and reward; ITF rules of tennis 1 and appendix I for the court.
+SMPLOlympics section 4 for goal and reward; ITF rules of tennis, rule 1, for the court.
 
 The reward leads the racket to the ball, then pays for every step in which the stroke is on its way
 into the court, more the nearer to the target, and for its bounce. Only one athlete has the ball to

@@ -68,7 +68,7 @@ class HandMadeRally(HandMade):
     def go(
         self,
         pos: Sequence[float],
-        linvel: Sequence[float] = (0.0, 0.0, 0.0),
+        linvel: Sequence[float] = (0.0, 0.0, -1.0),
         forces: dict | None = None,
     ) -> Advance:
         """One step that ends with the ball there, after the touches asked for."""
