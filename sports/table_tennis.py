@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import torch
 
 from sports import rackets, stroke
+from sports.ball import BALLS
 from sports.humanoid.body import Body, Shape
 from sports.physics.base import PhysicsState
 from sports.rackets import NET_RESTITUTION, Feed, Game, Serve
@@ -43,7 +44,7 @@ GAME = Game(
     court=Court(
         half_length=HALF_LENGTH,
         half_width=HALF_WIDTH,
-        line=0.02,
+        line=BALLS["table_tennis"].radius,
         height=HEIGHT,
         net_height=HEIGHT + NET_HEIGHT,
         net_rise=0.0,

@@ -23,6 +23,7 @@ from typing import Literal
 import torch
 
 from sports import rackets, stroke
+from sports.ball import BALLS
 from sports.humanoid.body import Body, Shape
 from sports.physics.base import PhysicsState
 from sports.rackets import NET_RESTITUTION, Feed, Game, Serve
@@ -41,14 +42,13 @@ NET_HALF_WIDTH = HALF_WIDTH + 0.914
 NET_HALF_THICKNESS = 0.01
 RACKET_RADIUS, RACKET_THICKNESS, RACKET_REACH = 0.15, 0.02, 0.35
 """m; as in ``sports/humanoid/data/equipment.csv``."""
-BALL_RADIUS = 0.032
 
 GAME = Game(
     law="tennis",
     court=Court(
         half_length=HALF_LENGTH,
         half_width=HALF_WIDTH,
-        line=BALL_RADIUS,
+        line=BALLS["tennis"].radius,
         height=0.0,
         net_height=NET_HEIGHT,
         net_rise=0.0,

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from sports import table_tennis, tennis
-from sports.ball import landing
-from sports.env import Env, make_env
+from sports.ball import crossing, landing, path
+from sports.env import Env, make_env, make_scene
 from sports.physics import default_state
 from tests.sports.rackets_made import HandMadeRally
 
@@ -315,3 +315,36 @@ def test_an_interrupted_match_goes_on_the_same():
         runs.append((torch.stack([s.reward for s in steps]), torch.stack([s.obs for s in steps])))
     assert torch.equal(runs[0][0], runs[1][0]) and torch.equal(runs[0][1], runs[1][1])
     assert runs[0][0].abs().sum() > 0
+
+
+def test_a_flight_crosses_the_net_where_its_path_does():
+    generator = torch.Generator().manual_seed(9)
+    n = 64
+    side = torch.where(torch.rand(n, generator=generator) < 0.5, 1.0, -1.0)
+    pos = 3.0 * torch.rand(n, 3, generator=generator) + torch.tensor((1.0, 0.0, 0.5))
+    linvel = 5.0 * torch.randn(n, 3, generator=generator)
+    linvel[:, 0] = -10.0 - 10.0 * torch.rand(n, generator=generator)
+    pos[:, 0], linvel[:, 0] = pos[:, 0] * side, linvel[:, 0] * side
+    spin = 100.0 * torch.randn(n, 3, generator=generator)
+    over, when = crossing("tennis", pos, linvel, spin, 0.0)
+    assert over[:, 0].abs().max() < 1e-4 and when.isfinite().all()
+    for i in range(n):
+        at = path("tennis", pos[i : i + 1], linvel[i : i + 1], spin[i : i + 1], [float(when[i])])
+        assert torch.allclose(at[0, 0], over[i], atol=1e-3)
+    _, never = crossing("tennis", pos, -linvel, 0 * spin, 0.0)
+    assert never.isinf().all()
+
+
+@pytest.mark.parametrize("sport", ["tennis", "table_tennis"])
+def test_the_ball_meets_the_racket_that_the_athlete_holds(sport):
+    scene = make_scene(f"{sport}_1v1")
+    disc = next(
+        s for s in scene.body.links[scene.body.link_index("R_Wrist")].shapes if s.kind == "cylinder"
+    )
+    low, high = torch.tensor(disc.center), torch.tensor(disc.end)
+    for agent in range(2):
+        surface = scene.surfaces[scene.surface_index(f"racket{agent}")]
+        assert surface.link == f"agent{agent}/R_Wrist" and surface.kind == "disc"
+        assert surface.center == pytest.approx(((low + high) / 2).tolist())
+        assert surface.size == pytest.approx((disc.size[0], float((high - low).norm()) / 2))
+        assert (high - low)[:2].norm() == 0.0  # its axis is the surface's z
