@@ -120,15 +120,10 @@ def conclude(
     returns = memory["returns"] + stroke.landed
     error_sum = memory["error_sum"] + error.masked_fill(~stroke.landed, 0.0)
     hits, errors = returns.sum(-1), error_sum.sum(-1)
-    success = hits > 0
-    metrics = {
-        "success": success.float(),
-        "hits": hits,
-        "error": nan_where(~success, errors / hits.clamp(min=1.0)),
-    }
+    metrics = {"hits": hits, "error": nan_where(hits == 0, errors / hits.clamp(min=1.0))}
     common = {**memory, "strokes": strokes, "returns": returns, "error_sum": error_sum}
     step = _solo if agents == 1 else _duel
-    return step(game, view, common, point, metrics, success, terms)
+    return step(game, view, common, point, metrics, terms)
 
 
 def _solo(
@@ -137,7 +132,6 @@ def _solo(
     memory: Memory,
     point: Point,
     metrics: dict[str, Tensor],
-    success: Tensor,
     terms: dict[str, Tensor],
 ) -> Advance:
     """The machine loses a point by a return: it launches the next ball."""
@@ -156,8 +150,12 @@ def _solo(
         "target": torch.where(row[..., None], aims(game, luck, 1), memory["target"]),
         "balls": memory["balls"] + again,
     }
-    contacts = memory["strokes"][:, 0]
-    metrics |= {"contacts": contacts, "contact_rate": contacts / memory["balls"]}
+    contacts, success = memory["strokes"][:, 0], metrics["hits"] > 0
+    metrics |= {
+        "success": success.float(),
+        "contacts": contacts,
+        "contact_rate": contacts / memory["balls"],
+    }
     return Advance(
         memory=memory,
         terms=terms,
@@ -174,10 +172,10 @@ def _duel(
     memory: Memory,
     point: Point,
     metrics: dict[str, Tensor],
-    success: Tensor,
     terms: dict[str, Tensor],
 ) -> Advance:
-    """One point: who gets a ball to play gets a new target."""
+    """One point: who gets a ball to play gets a new target. A success is a point that agent 0 has
+    won; ``points_for`` are its own."""
     struck, lost = point.struck, point.lost
     renewed = struck.flip(1)[..., None]
     memory = {
@@ -188,18 +186,20 @@ def _duel(
         "bounced": point.bounced,
         "target": torch.where(renewed, aims(game, _row(memory), 2), memory["target"]),
     }
-    won = (lost.flip(1) & ~lost).float()
+    won = lost.flip(1) & ~lost
+    points_for, points_against = won.float().unbind(-1)
     metrics |= {
+        "success": points_for,
         "rally": memory["strokes"].sum(-1),
-        "points_0": won[:, 0],
-        "points_1": won[:, 1],
+        "points_for": points_for,
+        "points_against": points_against,
     }
     return Advance(
         memory=memory,
         terms=terms,
         terminated=lost.any(-1, keepdim=True).expand(-1, 2),
         metrics=metrics,
-        success=success,
+        success=won[:, 0],
     )
 
 

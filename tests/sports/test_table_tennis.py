@@ -282,8 +282,9 @@ def test_a_point_is_fed_to_either_side_and_won_by_one():
     world.go((0.9, 0.0, 0.9), (4.0, 0.0, 2.0))
     step = world.go((3.55, 0.9, 0.9))
     assert step.terminated.all()
-    assert step.metrics["points_1"][0] == 1.0 and step.metrics["points_0"][0] == 0.0
-    assert step.metrics["rally"][0] == 1.0 and step.success[0]
+    assert step.metrics["points_against"][0] == 1.0 and step.metrics["points_for"][0] == 0.0
+    assert step.metrics["rally"][0] == 1.0 and step.metrics["hits"][0] == 1.0
+    assert not step.success[0]  # agent 1 has won
 
 
 def test_a_second_return_is_worth_more_to_its_own_side_alone():

@@ -413,7 +413,7 @@ def test_a_decided_point_ends_the_episode_of_both():
     world.touch("ground", (11.0, 0.0, 0.032))
     step = world.go((11.2, 0.0, 0.3))
     assert step.terminated.tolist() == [[True, True]]
-    assert step.metrics["points_0"][0] == 0.0 and step.metrics["points_1"][0] == 1.0
+    assert step.metrics["points_for"][0] == 0.0 and step.metrics["points_against"][0] == 1.0
     world = duel(towards=-1.0)
     world.touch("ground", (-7.5, 0.0, 0.032))
     world.go((-7.8, 0.0, 0.3))
@@ -421,8 +421,8 @@ def test_a_decided_point_ends_the_episode_of_both():
     world.go((-9.5, 0.0, 1.2), (25.0, 0.0, 5.0))
     world.touch("ground", (12.5, 0.0, 0.032))
     step = world.go((12.8, 0.0, 0.3))
-    assert step.terminated.all() and step.metrics["points_0"][0] == 1.0
-    assert step.metrics["points_1"][0] == 0.0 and not step.success[0]
+    assert step.terminated.all() and step.metrics["points_for"][0] == 1.0
+    assert step.metrics["points_against"][0] == 0.0 and step.success[0]
 
 
 def test_the_solo_policy_finds_its_features_first_in_a_duel():
