@@ -5,9 +5,11 @@ bounce in the other half of the court (anywhere else it is out; a ball that meet
 and is out when it comes down on the wrong side); the other side must then hit it before it bounces
 again. A stroke is a foul if the same side hit the ball last, if it meets the ball beyond the net,
 or, where volleys are not allowed, before the ball has bounced. A point is also lost by a side whose
-athlete falls, crosses the net or is met by the ball, and when the ball leaves the space of play: by
-the receiver after a good bounce, else by the side that hit it. Source: ITF rules of tennis 12, 24
-and 25; ITTF laws of table tennis 2.7 and 2.10. Let balls are played on.
+athlete falls, crosses the net or is met by the ball; and when the ball leaves the space of play or
+stops (on the net), by the receiver after a good bounce, else by the side that hit it. Let balls are
+played on. Two impacts on a racket within a control step (33 ms) are one stroke, as the rules have
+it of a ball hit twice in one swing; a contact in a later step is a second one. Source: ITF rules of
+tennis 12, 24 and 25; ITTF laws of table tennis 2.7 and 2.10.
 
 Sides are +1 (the half x > 0, agent 0) and -1 (agent 1, or the machine of the tasks with one
 athlete). Within a control step impacts are taken in the order of their times. World frame, m, s.
@@ -24,10 +26,12 @@ import torch
 from torch import Tensor
 
 from sports.physics.base import Physics
-from sports.task import View, constant
+from sports.task import View, constant, squared
 
 SIDES = (1.0, -1.0)
 """Of agent 0 and of its opponent."""
+STOPPED = 0.05
+"""A ball slower than this (m/s) lies somewhere."""
 
 
 @dataclass(frozen=True)
@@ -113,13 +117,19 @@ class Point:
 
 
 def play(
-    court: Court, hitter: Tensor, bounced: Tensor, touch: Touches, ball: Tensor, late: Tensor
+    court: Court,
+    hitter: Tensor,
+    bounced: Tensor,
+    touch: Touches,
+    ball: Tensor,
+    linvel: Tensor,
+    late: Tensor,
 ) -> Point:
     """One control step of a point.
 
-    ``hitter`` (N,) and ``bounced`` (N,) are those of the last step, ``ball`` (N, 3) is where the
-    ball is now, ``late`` (N, A) says whose athlete loses the point by something that has no time
-    within the step: it counts where no impact has decided the point.
+    ``hitter`` (N,) and ``bounced`` (N,) are those of the last step, ``ball`` and ``linvel`` (N, 3)
+    the place and velocity of the ball now. ``late`` (N, A) says whose athlete loses the point by
+    something that has no time within the step: it counts where no impact has decided the point.
     """
     ends = constant(SIDES, ball.device)
     sides = ends[: touch.strokes.shape[1]]
@@ -153,8 +163,8 @@ def play(
     hitter = torch.where(swung, ends[when.masked_fill(~struck, -1.0).argmax(-1)], hitter)
     bounced = bounced & ~swung
 
-    # Bounces after the stroke. Where there was one before it too, this one's place is unknown, but
-    # within a step of the stroke and so on the striker's own side.
+    # Bounces after the stroke. Where there was one before it too, this one's place is not known,
+    # but so near to the stroke that it is on the striker's own side.
     after = touch.bounces > before
     good = after & ~early & inside & (spot_x * hitter < 0)
     rest = (after & ~good).float() - (good & (touch.bounces > before + 1)).float()
@@ -164,7 +174,7 @@ def play(
     # What has no time within the step.
     x, _, z = ball.unbind(-1)
     high = z > court.ceiling
-    gone = (z < court.floor) | (x.abs() > court.behind)
+    gone = (z < court.floor) | (x.abs() > court.behind) | (squared(linvel) < STOPPED**2)
     by_leaving = torch.where(bounced & ~high, -hitter, hitter) * (high | gone)
 
     fouled = foul.any(-1)

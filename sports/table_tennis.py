@@ -17,7 +17,8 @@ from dataclasses import dataclass
 
 import torch
 
-from sports import rackets
+from sports import rackets, stroke
+from sports.ball import BALLS
 from sports.humanoid.body import Body, Shape
 from sports.physics.base import PhysicsState
 from sports.rackets import NET_RESTITUTION, Feed, Game, Serve
@@ -43,7 +44,7 @@ GAME = Game(
     court=Court(
         half_length=HALF_LENGTH,
         half_width=HALF_WIDTH,
-        line=0.02,
+        line=BALLS["table_tennis"].radius,
         height=HEIGHT,
         net_height=HEIGHT + NET_HEIGHT,
         net_rise=0.0,
@@ -140,13 +141,13 @@ def features(view: View, memory: Memory) -> dict[str, torch.Tensor]:
 
 def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
-    stroke = rackets.judge(GAME, view, memory)
-    worth = 1.0 + (-stroke.miss).exp() + stroke.returns
+    now = stroke.judge(GAME, view, memory)
+    worth = 1.0 + (-now.miss).exp() + now.returns
     terms = {
-        "approach": (-SHARPNESS * stroke.racket_distance).exp() * stroke.reaching,
-        "landing": worth * stroke.promising,
+        "approach": (-SHARPNESS * now.racket_distance).exp() * now.reaching,
+        "landing": worth * now.promising,
     }
-    return rackets.conclude(GAME, view, memory, stroke, terms)
+    return stroke.conclude(GAME, view, memory, now, terms)
 
 
 def scene_1v1(config: TableTennis, body: Body) -> Scene:
@@ -185,8 +186,8 @@ DUEL = dataclasses.replace(
         "hits": "returns",
         "error": "m",
         "rally": "strokes",
-        "points_0": "fraction",
-        "points_1": "fraction",
+        "points_for": "fraction",
+        "points_against": "fraction",
     },
     main_metric="rally",
     summary="Play a point of table tennis against another athlete.",

@@ -4,7 +4,7 @@ The net is the plane x = 0. The athlete of ``tennis`` stands at (13, 0) facing -
 launches from x = -12.5, again as soon as a return has bounced and gone; the first point lost ends
 the episode. In ``tennis_1v1`` agent 0 stands there and agent 1 at (-13, 0); the ball is let go over
 the net towards one of them, and the episode is one point. Rules: ``sports/rally.py``. Source:
-SMPLOlympics section 4 for goal and reward; ITF rules of tennis 1 and appendix I for the court.
+SMPLOlympics section 4 for goal and reward; ITF rules of tennis, rule 1, for the court.
 
 The reward leads the racket to the ball, then pays for every step in which the stroke is on its way
 into the court, more the nearer to the target, and for its bounce. Only one athlete has the ball to
@@ -22,7 +22,8 @@ from typing import Literal
 
 import torch
 
-from sports import rackets
+from sports import rackets, stroke
+from sports.ball import BALLS
 from sports.humanoid.body import Body, Shape
 from sports.physics.base import PhysicsState
 from sports.rackets import NET_RESTITUTION, Feed, Game, Serve
@@ -41,14 +42,13 @@ NET_HALF_WIDTH = HALF_WIDTH + 0.914
 NET_HALF_THICKNESS = 0.01
 RACKET_RADIUS, RACKET_THICKNESS, RACKET_REACH = 0.15, 0.02, 0.35
 """m; as in ``sports/humanoid/data/equipment.csv``."""
-BALL_RADIUS = 0.032
 
 GAME = Game(
     law="tennis",
     court=Court(
         half_length=HALF_LENGTH,
         half_width=HALF_WIDTH,
-        line=BALL_RADIUS,
+        line=BALLS["tennis"].radius,
         height=0.0,
         net_height=NET_HEIGHT,
         net_rise=0.0,
@@ -159,13 +159,13 @@ def features(view: View, memory: Memory) -> dict[str, torch.Tensor]:
 def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
     rules = game(view.config)
-    stroke = rackets.judge(rules, view, memory)
+    now = stroke.judge(rules, view, memory)
     terms = {
-        "approach": (-stroke.racket_distance).exp() * stroke.reaching,
-        "landing": (1.0 + (-stroke.miss).exp()) * stroke.promising,
-        "bounce": stroke.landed.float(),
+        "approach": (-now.racket_distance).exp() * now.reaching,
+        "landing": (1.0 + (-now.miss).exp()) * now.promising,
+        "bounce": now.landed.float(),
     }
-    return rackets.conclude(rules, view, memory, stroke, terms)
+    return stroke.conclude(rules, view, memory, now, terms)
 
 
 def scene_1v1(config: Tennis, body: Body) -> Scene:
@@ -204,8 +204,8 @@ DUEL = dataclasses.replace(
         "hits": "returns",
         "error": "m",
         "rally": "strokes",
-        "points_0": "fraction",
-        "points_1": "fraction",
+        "points_for": "fraction",
+        "points_against": "fraction",
     },
     main_metric="rally",
     summary="Play a point of tennis against another athlete.",

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sports.task import Advance
 from tests.sports.hand_made import HandMade
 
-Place = tuple[float, float, float]
 AIR, GRAVITY = 1.204, 9.81
 DRAG = {"tennis": (0.55, 0.032, 0.058), "table_tennis": (0.45, 0.020, 0.0027)}
 """Coefficient, radius (m), mass (kg) of the balls: the table of the physics page."""
@@ -58,14 +58,19 @@ class HandMadeRally(HandMade):
         self.state.qpos[:, q.start : q.start + 3] = torch.as_tensor(pos, dtype=torch.float32)
         self.state.qvel[:, v.start : v.start + 3] = torch.as_tensor(linvel, dtype=torch.float32)
 
-    def touch(self, surface: str, pos: Place, time: float = 0.01, count: int = 1) -> None:
+    def touch(self, surface: str, pos: Sequence[float], time: float = 0.01, count: int = 1) -> None:
         """The ball meets a surface in the next step."""
         s, physics = self.scene.surface_index(surface), self.env.physics
         physics.ball_hits[:, s] = count
         physics.ball_hit_time[:, s] = time
         physics.ball_hit_pos[:, s] = torch.tensor(pos)
 
-    def go(self, pos: Place, linvel: Place = (0.0, 0.0, 0.0), forces: dict | None = None):
+    def go(
+        self,
+        pos: Sequence[float],
+        linvel: Sequence[float] = (0.0, 0.0, -1.0),
+        forces: dict | None = None,
+    ) -> Advance:
         """One step that ends with the ball there, after the touches asked for."""
         self.put_ball(pos, linvel)
         self._apply()
@@ -85,6 +90,11 @@ class HandMadeRally(HandMade):
     def goal(self, name: str) -> Tensor:
         """(N, A, k) one of the goal features."""
         return self.observe()[..., self.env.obs_slices[f"goal/{name}"]]
+
+
+def launched(step: Advance) -> bool:
+    """Whether the machine launched a ball in the first world."""
+    return step.move is not None and bool(step.move.mask[0])
 
 
 @cache

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from sports import table_tennis, tennis
-from sports.ball import landing
-from sports.env import Env, make_env
+from sports.ball import crossing, landing, path
+from sports.env import Env, make_env, make_scene
 from sports.physics import default_state
 from tests.sports.rackets_made import HandMadeRally
 
@@ -18,6 +18,11 @@ GAMES = {"tennis": tennis.GAME, "table_tennis": table_tennis.GAME}
 TASKS = ("tennis", "tennis_1v1", "table_tennis", "table_tennis_1v1")
 SPEEDS = {"tennis": (20.0, 2.0, 6.0), "table_tennis": (5.0, 0.5, 2.0)}
 """Largest velocities of the ball in the tests (m/s)."""
+SWAPPED = {
+    "success": "points_against",
+    "points_for": "points_against",
+    "points_against": "points_for",
+}
 N = 48
 HALF_TURN = torch.tensor((-1.0, -1.0, 1.0))
 
@@ -125,11 +130,11 @@ def test_both_ends_of_the_court_are_alike(sport):
             steps.append(step)
         a, b = steps
         assert torch.equal(a.terminated, b.terminated.flip(1))
-        assert torch.equal(a.success, b.success)
+        assert torch.equal(a.success.float(), b.metrics["points_against"])
         for name, term in a.terms.items():
             assert torch.allclose(term, b.terms[name].flip(1), atol=1e-5), name
         for name, value in a.metrics.items():
-            other = {"points_0": "points_1", "points_1": "points_0"}.get(name, name)
+            other = SWAPPED.get(name, name)
             assert torch.allclose(value, b.metrics[other], atol=1e-5, equal_nan=True), name
         seen["struck"] += int(a.memory["strokes"].sum())
         seen["over"] += int(a.terminated.sum())
@@ -298,3 +303,53 @@ def test_both_mujocos_play_the_same_second(task):
     assert torch.equal(hits, other_hits) and hits[:, -env.num_agents].sum() >= 1
     assert torch.allclose(reward, other_reward, atol=2e-3) and reward.max() >= 1.0
     assert torch.allclose(ball, other_ball, atol=5e-3)
+
+
+def test_an_interrupted_match_goes_on_the_same():
+    """Saved and loaded in mid-rally: the same balls, points and rewards come."""
+    env = make_env("table_tennis", num_worlds=8, seed=4, physics_options={"threads": 1})
+    generator = torch.Generator().manual_seed(0)
+    actions = 0.2 * torch.randn(60, 8, 1, env.action_size, generator=generator)
+    for action in actions[:15]:
+        env.step(action)
+    saved = env.state_dict()
+    runs = []
+    for _ in range(2):
+        env.load_state_dict(saved)
+        steps = [env.step(action) for action in actions[15:]]
+        runs.append((torch.stack([s.reward for s in steps]), torch.stack([s.obs for s in steps])))
+    assert torch.equal(runs[0][0], runs[1][0]) and torch.equal(runs[0][1], runs[1][1])
+    assert runs[0][0].abs().sum() > 0
+
+
+def test_a_flight_crosses_the_net_where_its_path_does():
+    generator = torch.Generator().manual_seed(9)
+    n = 64
+    side = torch.where(torch.rand(n, generator=generator) < 0.5, 1.0, -1.0)
+    pos = 3.0 * torch.rand(n, 3, generator=generator) + torch.tensor((1.0, 0.0, 0.5))
+    linvel = 5.0 * torch.randn(n, 3, generator=generator)
+    linvel[:, 0] = -10.0 - 10.0 * torch.rand(n, generator=generator)
+    pos[:, 0], linvel[:, 0] = pos[:, 0] * side, linvel[:, 0] * side
+    spin = 100.0 * torch.randn(n, 3, generator=generator)
+    over, when = crossing("tennis", pos, linvel, spin, 0.0)
+    assert over[:, 0].abs().max() < 1e-4 and when.isfinite().all()
+    for i in range(n):
+        at = path("tennis", pos[i : i + 1], linvel[i : i + 1], spin[i : i + 1], [float(when[i])])
+        assert torch.allclose(at[0, 0], over[i], atol=1e-3)
+    _, never = crossing("tennis", pos, -linvel, 0 * spin, 0.0)
+    assert never.isinf().all()
+
+
+@pytest.mark.parametrize("sport", ["tennis", "table_tennis"])
+def test_the_ball_meets_the_racket_that_the_athlete_holds(sport):
+    scene = make_scene(f"{sport}_1v1")
+    disc = next(
+        s for s in scene.body.links[scene.body.link_index("R_Wrist")].shapes if s.kind == "cylinder"
+    )
+    low, high = torch.tensor(disc.center), torch.tensor(disc.end)
+    for agent in range(2):
+        surface = scene.surfaces[scene.surface_index(f"racket{agent}")]
+        assert surface.link == f"agent{agent}/R_Wrist" and surface.kind == "disc"
+        assert surface.center == pytest.approx(((low + high) / 2).tolist())
+        assert surface.size == pytest.approx((disc.size[0], float((high - low).norm()) / 2))
+        assert (high - low)[:2].norm() == 0.0  # its axis is the surface's z

@@ -12,9 +12,10 @@ import torch
 from sports import table_tennis, tennis
 from sports.humanoid import load_body
 from sports.physics import Geometry, make_physics
-from sports.rackets import BODY_DISTANCE, HAND
+from sports.rackets import HAND
 from sports.rally import Court, Touches, met, play
 from sports.scene import humanoid_scene
+from sports.stroke import BODY_DISTANCE
 
 TENNIS, TABLE = tennis.GAME.court, table_tennis.GAME.court
 NOWHERE = (0.0, 0.0, 0.0)
@@ -28,6 +29,7 @@ def step(
     bounce: tuple[float, tuple[float, float, float]] = (math.inf, NOWHERE),
     strokes: tuple[tuple[float, tuple[float, float, float]] | None, ...] = (None,),
     ball: tuple[float, float, float] = (5.0, 0.0, 1.0),
+    speed: float = 1.0,
     late: tuple[bool, ...] | None = None,
 ):
     """One world, one step. ``bounce`` and each of ``strokes`` are a time (s) and a place."""
@@ -48,6 +50,7 @@ def step(
         torch.tensor([bounced]),
         touch,
         torch.tensor([ball]),
+        torch.tensor([(0.0, 0.6 * speed, -0.8 * speed)]),
         torch.tensor([late or (False,) * len(strokes)]),
     )
 
@@ -191,6 +194,15 @@ def test_a_ball_hit_too_high_is_lost(court, height):
     assert lost(step(court, hitter=1.0, ball=(1, 0, height + 0.01))) == NEAR
 
 
+@pytest.mark.parametrize(("speed", "lies"), [(0.06, False), (0.04, True)])
+def test_a_ball_that_lies_on_the_net_is_out(speed, lies):
+    """Left there it would be about to fall into the far court for ever."""
+    on_top = step(hitter=1.0, ball=(-0.001, 0, 1.032), speed=speed)
+    assert lost(on_top) == (NEAR if lies else NOBODY)
+    later = step(hitter=1.0, bounced=True, ball=(-3.0, 0, 0.032), speed=speed)
+    assert lost(later) == (FAR if lies else NOBODY)
+
+
 def test_what_has_no_time_counts_where_no_impact_has_decided():
     assert lost(step(late=(True,))) == NEAR
     # The return was already out when the athlete fell.
@@ -233,10 +245,12 @@ def random_touches(n: int, generator: torch.Generator) -> tuple:
     hitter = torch.where(some(n) < 0.5, 1.0, -1.0)
     ball = places(n) * torch.tensor((2.2, 1.0, 1.0))
     ball[:, 2] = 3.0 * some(n)
-    return hitter, some(n) < 0.5, touch, ball, some(n, 2) < 0.2
+    linvel = 0.2 * places(n)
+    linvel[:, 2] = 0.0
+    return hitter, some(n) < 0.5, touch, ball, linvel, some(n, 2) < 0.2
 
 
-def umpire(court: Court, hitter, bounced, touch: Touches, ball, late, i: int) -> dict:
+def umpire(court: Court, hitter, bounced, touch: Touches, ball, linvel, late, i: int) -> dict:
     """World ``i``, event by event."""
     side_of = (1.0, -1.0)
     state = {"hitter": float(hitter[i]), "bounced": bool(bounced[i])}
@@ -290,7 +304,8 @@ def umpire(court: Court, hitter, bounced, touch: Touches, ball, late, i: int) ->
     if not any(lost.values()):
         x, _, z = ball[i].tolist()
         high = z > court.ceiling
-        if high or z < court.floor or abs(x) > court.behind:
+        lies = math.hypot(*linvel[i].tolist()) < 0.05
+        if high or z < court.floor or abs(x) > court.behind or lies:
             loser = -state["hitter"] if state["bounced"] and not high else state["hitter"]
             lost[loser] = True
         for agent in range(2):
@@ -342,10 +357,14 @@ def turned(touch: Touches) -> Touches:
 
 @pytest.mark.parametrize("court", [TENNIS, TABLE])
 def test_the_rules_are_the_same_for_both_sides(court):
-    hitter, bounced, touch, ball, late = random_touches(2000, torch.Generator().manual_seed(6))
-    here = play(court, hitter, bounced, touch, ball, late)
+    hitter, bounced, touch, ball, linvel, late = random_touches(
+        2000, torch.Generator().manual_seed(6)
+    )
+    here = play(court, hitter, bounced, touch, ball, linvel, late)
     half_turn = torch.tensor((-1.0, -1.0, 1.0))
-    there = play(court, -hitter, bounced, turned(touch), ball * half_turn, late.flip(1))
+    there = play(
+        court, -hitter, bounced, turned(touch), ball * half_turn, linvel * half_turn, late.flip(1)
+    )
     assert torch.equal(here.lost, there.lost.flip(1))
     assert torch.equal(here.struck, there.struck.flip(1))
     assert torch.equal(here.landed, there.landed) and torch.equal(here.bounced, there.bounced)
@@ -356,10 +375,11 @@ def test_the_rules_are_the_same_for_both_sides(court):
 def test_worlds_do_not_know_of_each_other(court):
     situation = random_touches(500, torch.Generator().manual_seed(7))
     order = torch.randperm(500, generator=torch.Generator().manual_seed(8))
-    hitter, bounced, touch, ball, late = situation
+    hitter, bounced, touch, *rest = situation
     shuffled = Touches(*(t[order] for t in touch))
     here = play(court, *situation)
-    there = play(court, hitter[order], bounced[order], shuffled, ball[order], late[order])
+    rest = [x[order] for x in rest]
+    there = play(court, hitter[order], bounced[order], shuffled, *rest)
     for name, value in vars(here).items():
         assert torch.equal(value[order], getattr(there, name)), name
 

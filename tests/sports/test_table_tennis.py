@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from sports import rackets, table_tennis
-from tests.sports.rackets_made import HandMadeRally, flights, made, where_through
+from sports.humanoid.mjcf import build_model
+from tests.sports.rackets_made import HandMadeRally, flights, launched, made, where_through
 
 STANDING = 0.9412
 PADDLE = (
@@ -86,7 +87,7 @@ def test_after_contact_it_pays_for_the_landing_and_for_the_returns_so_far():
         step = world.go((-1.0, -0.2, 0.9), (-3.0, 0.0, 1.5))
         assert all(term[0, 0] == 0.0 for term in step.terms.values())
         assert step.metrics["hits"][0] == returns + 1
-        assert world.go((-1.6, 0.0, 0.9)).move.mask[0]
+        assert launched(world.go((-1.6, 0.0, 0.9)))
         world.touch("table", (0.8, 0.2, 0.78))
         assert not far(world.go((0.9, 0.2, 0.9), (3.5, 0.0, 1.5)))
 
@@ -157,7 +158,7 @@ def test_the_next_ball_comes_when_the_return_is_gone(ball, again):
     world = rally()
     assert not far(play_return(world))
     step = world.go(ball, (-3.0, 0.0, -1.0))
-    assert bool(step.move.mask[0]) is again and not far(step)
+    assert launched(step) is again and not far(step)
 
 
 def test_the_next_ball_comes_when_the_return_has_bounced_twice():
@@ -165,7 +166,7 @@ def test_the_next_ball_comes_when_the_return_has_bounced_twice():
     play_return(world)
     world.touch("table", (-1.1, 0.0, 0.78))
     step = world.go((-1.2, 0.0, 0.85))
-    assert step.move.mask[0] and not far(step) and step.metrics["hits"][0] == 1.0
+    assert launched(step) and not far(step) and step.metrics["hits"][0] == 1.0
 
 
 # How a point is lost.
@@ -246,7 +247,7 @@ def test_features_are_seen_from_the_athlete():
 
 
 def test_table_and_net_are_solid_and_stand_where_the_rules_say():
-    model = made("table_tennis").env.physics.model
+    model = build_model(made("table_tennis").scene)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
 
@@ -281,8 +282,9 @@ def test_a_point_is_fed_to_either_side_and_won_by_one():
     world.go((0.9, 0.0, 0.9), (4.0, 0.0, 2.0))
     step = world.go((3.55, 0.9, 0.9))
     assert step.terminated.all()
-    assert step.metrics["points_1"][0] == 1.0 and step.metrics["points_0"][0] == 0.0
-    assert step.metrics["rally"][0] == 1.0 and step.success[0]
+    assert step.metrics["points_against"][0] == 1.0 and step.metrics["points_for"][0] == 0.0
+    assert step.metrics["rally"][0] == 1.0 and step.metrics["hits"][0] == 1.0
+    assert not step.success[0]  # agent 1 has won
 
 
 def test_a_second_return_is_worth_more_to_its_own_side_alone():

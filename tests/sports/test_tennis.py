@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from sports import rackets, tennis
-from sports.env import make_env
-from tests.sports.rackets_made import HandMadeRally, flights, made, where_through
+from sports.env import make_env, make_scene
+from sports.humanoid.mjcf import build_model
+from tests.sports.rackets_made import HandMadeRally, flights, launched, made, where_through
 
 STANDING = 0.9412
 RALLY = ((-10.0, 0.0, 1.0), (20.0, 0.0, 3.0))
@@ -156,7 +157,7 @@ def test_the_next_ball_comes_when_the_return_is_gone(x, again):
     world = returned()
     before = world.env.memory["target"].clone()
     step = world.go((x, 0.5, 1.0), (-10.0, 0.0, 0.0))
-    assert step.move is not None and bool(step.move.mask[0]) is again and not far(step)
+    assert step.move is not None and launched(step) is again and not far(step)
     memory = world.env.memory
     assert memory["hitter"][0] == (-1.0 if again else 1.0)
     assert bool((memory["target"] != before).any()) is again
@@ -179,16 +180,16 @@ def test_the_next_ball_comes_when_the_return_has_bounced_twice():
     world = returned()
     world.touch("ground", (-10.0, 0.5, 0.032))
     step = world.go((-10.2, 0.5, 0.2))
-    assert bool(step.move.mask[0]) and not far(step) and step.metrics["hits"][0] == 1.0
+    assert launched(step) and not far(step) and step.metrics["hits"][0] == 1.0
 
 
 def test_a_return_out_of_court_brings_no_next_ball():
     world = rally()
     stroke(world)
-    assert not world.go((-12.95, 0.0, 1.0), (-20.0, 0.0, -2.0)).move.mask[0]
+    assert not launched(world.go((-12.95, 0.0, 1.0), (-20.0, 0.0, -2.0)))
     world.touch("ground", (-14.0, 0.0, 0.032))
     step = world.go((-14.2, 0.0, 0.2))
-    assert far(step) and not step.move.mask[0] and step.metrics["hits"][0] == 0.0
+    assert far(step) and not launched(step) and step.metrics["hits"][0] == 0.0
 
 
 def test_launches_land_in_the_box_over_the_net_and_under_the_roof():
@@ -305,7 +306,7 @@ def test_hits_error_and_contact_rate():
     assert step.metrics["hits"][0] == 1.0
     assert step.metrics["error"][0] == pytest.approx(0.5, abs=1e-4)
     step = world.go((-13.0, 0.0, 1.0))
-    assert step.move.mask[0]
+    assert launched(step)
     target = world.env.memory["target"][0, 0].tolist()
     world.touch("ground", (8.0, 0.0, 0.032))
     world.go((8.3, 0.0, 0.4))
@@ -412,7 +413,7 @@ def test_a_decided_point_ends_the_episode_of_both():
     world.touch("ground", (11.0, 0.0, 0.032))
     step = world.go((11.2, 0.0, 0.3))
     assert step.terminated.tolist() == [[True, True]]
-    assert step.metrics["points_0"][0] == 0.0 and step.metrics["points_1"][0] == 1.0
+    assert step.metrics["points_for"][0] == 0.0 and step.metrics["points_against"][0] == 1.0
     world = duel(towards=-1.0)
     world.touch("ground", (-7.5, 0.0, 0.032))
     world.go((-7.8, 0.0, 0.3))
@@ -420,8 +421,8 @@ def test_a_decided_point_ends_the_episode_of_both():
     world.go((-9.5, 0.0, 1.2), (25.0, 0.0, 5.0))
     world.touch("ground", (12.5, 0.0, 0.032))
     step = world.go((12.8, 0.0, 0.3))
-    assert step.terminated.all() and step.metrics["points_0"][0] == 1.0
-    assert step.metrics["points_1"][0] == 0.0 and not step.success[0]
+    assert step.terminated.all() and step.metrics["points_for"][0] == 1.0
+    assert step.metrics["points_against"][0] == 0.0 and step.success[0]
 
 
 def test_the_solo_policy_finds_its_features_first_in_a_duel():
@@ -433,8 +434,7 @@ def test_the_solo_policy_finds_its_features_first_in_a_duel():
 
 def test_both_options_of_the_net_stand_where_the_rules_say():
     for net, heights in (("level", (1.0, 1.0)), ("rules", (0.914 + 0.0031, 1.07))):
-        env = make_env("tennis", num_worlds=1, options={"net": net}, physics_options={"threads": 1})
-        model = env.physics.model
+        model = build_model(make_scene("tennis", options={"net": net}))
         tops = []
         for y in (0.1, 5.0285):
             data = mujoco.MjData(model)
