@@ -5,11 +5,13 @@ tee at the origin and play is along +x, to the athlete's left. The ball is moved
 (``sports/ball.py``); the athlete stands on the plane z = 0 everywhere: the waves are in the ball
 law and in the drawing. The head of the club must meet the ball once; the ball then flies, lands,
 rolls and rests, which ends the episode. Source: SMPLOlympics section 4 for goal, reward and start;
-Rules of Golf, rule 10.1a (the ball is struck with the head of the club, not pushed or scooped).
+Rules of Golf, rule 10.1a: the ball is struck with the head of the club, not pushed or scooped, and
+a stroke that happens to hit it twice is one stroke.
 
-Fouls end the episode and are no hits: the ball goes backwards, a second contact of the head, a
-contact of the shaft, a link near the ball. The landing in the reward is the first contact of the
-ball with the turf: until then the one that the ball law predicts when the ball is hit.
+Fouls end the episode and are no hits: the ball goes backwards or stays on its tee, the shaft meets
+it first, the club meets it again after ``STROKE_TIME``, a link comes near it. The landing in the
+reward is the first contact of the ball with the turf: until then the one that the ball law predicts
+when the ball is hit.
 
 At the start the head is 2.55 m from the ball, where the paper's reward for nearing it,
 exp(-100 d^2), is zero in float32: it leads nobody there. The option ``reach`` pays for every metre
@@ -102,7 +104,7 @@ def scene(config: Golf, body: Body) -> Scene:
     """Ball, tee and turf, and what of the club the ball can meet."""
     shaft, head = body.links[body.link_index(TOOL)].shapes
     assert shaft.end is not None
-    middle = tuple((a + b) / 2 for a, b in zip(shaft.center, shaft.end))
+    x, y, z = ((a + b) / 2 for a, b in zip(shaft.center, shaft.end))
     # A square shaft: the ball is twice as thick, so that its edges matter little.
     along = math.dist(shaft.center, shaft.end) / 2
     thick = (shaft.size[0], along, shaft.size[0])
@@ -130,7 +132,7 @@ def scene(config: Golf, body: Body) -> Scene:
             turf,
             Surface("tee", kind="box", center=(0.0, 0.0, TEE_HEIGHT / 2), size=tee),
             Surface("head", kind="box", center=head.center, size=head.size, link=link),
-            Surface("shaft", kind="box", center=middle, size=thick, link=link),
+            Surface("shaft", kind="box", center=(x, y, z), size=thick, link=link),
         ),
         sites={"tee": (0.0, 0.0, TEE_HEIGHT)},
     )
@@ -256,12 +258,13 @@ def advance(view: View, memory: Memory) -> Advance:
     speed = length(linvel)
     launch_speed = torch.where(first, speed, memory["launch_speed"])
     still = (memory["still"] + 1) * (contact & (speed < REST_SPEED))
-    rests = still >= REST_STEPS
+    at_rest = still >= REST_STEPS
+    rests, stayed = at_rest & landed, at_rest & ~landed
 
-    aside = squared(physics.body_pos[:, 0] - ball[:, None])
-    others = constant(_kick_distances(physics.scene.body.link_names), ball.device)
-    kicked = (aside < others).any(-1)
-    foul = again | shaft_first | backwards | kicked
+    to_links = squared(physics.body_pos[:, 0] - ball[:, None])
+    least = constant(_kick_distances(physics.scene.body.link_names), ball.device)
+    kicked = (to_links < least).any(-1)
+    foul = again | shaft_first | backwards | kicked | stayed
     late = view.clock >= round(PATIENCE / view.control_timestep)
     missed = ~contact & (late | view.fallen()[:, 0])
     hit = contact & ~foul
@@ -291,6 +294,7 @@ def advance(view: View, memory: Memory) -> Advance:
         "success": hit.float(),
         "hit_rate": hit.float(),
         "contact": contact.float(),
+        "foul": foul.float(),
         "nearest": nearest,
     }
     return Advance(
@@ -334,6 +338,7 @@ TASK = Task(
         "carry": "m",
         "launch_speed": "m/s",
         "contact": "fraction",
+        "foul": "fraction",
         "nearest": "m",
     },
     main_metric="success",

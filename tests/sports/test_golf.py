@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from sports.ball import BALLS, landing, landing_on_waves
+from sports.ball import path as ball_path
+from sports.ball_law.compiled import for_gpu
 from sports.env import Env, make_env
-from sports.golf import HEAD, SHAFT, TEE, TURF, head_pos, turf_height
+from sports.golf import HEAD, SHAFT, TEE, TURF, WAVES, head_pos, turf_height
 from sports.humanoid import load_body
 from sports.physics import PhysicsState
+from sports.task import Advance
 from tests.sports.hand_made import HandMade
 
 STANDING = 0.9417
@@ -21,8 +25,8 @@ class Stroke(HandMade):
     """An athlete at its place, a ball and its hits as the test wants them."""
 
     def __init__(self, num_worlds: int = 1, **options: object) -> None:
-        options = {"terrain": "flat", "distance": 10.0} | options
-        super().__init__("golf", num_worlds, **options)
+        chosen = {"terrain": "flat", "distance": 10.0} | options
+        super().__init__("golf", num_worlds, **chosen)
         self.hits: dict[int, float] = {}
         self.hit_at = (0.0, 0.0, 0.0)
 
@@ -50,7 +54,7 @@ class Stroke(HandMade):
 
 
 def addressed(**options: object) -> Stroke:
-    stroke = Stroke(**options)
+    stroke = Stroke(1, **options)
     stroke.begin()
     return stroke
 
@@ -61,6 +65,11 @@ def struck(**options: object) -> Stroke:
     stroke.ball((0.5, 0.0, 0.3), (12.0, 0.0, 4.0))
     assert not stroke.step([HEAD]).terminated[0, 0]
     return stroke
+
+
+def paid_on(step: Advance) -> bool:
+    assert step.remaining_paid is not None
+    return bool(step.remaining_paid[0])
 
 
 # The turf.
@@ -234,8 +243,8 @@ def test_a_ball_may_not_go_backwards(x: float, foul: bool):
     stroke.ball((x, 0.0, 0.05), (-1.0, 0.0, 0.0))
     step = stroke.step([HEAD])
     assert bool(step.terminated[0, 0]) is foul
-    assert step.metrics["contact"][0] == 1
-    assert bool(step.success[0]) is not foul and not step.remaining_paid[0]
+    assert step.metrics["contact"][0] == 1 and step.metrics["foul"][0] == foul
+    assert bool(step.success[0]) is not foul and not paid_on(step)
 
 
 def test_a_ball_that_has_landed_may_roll_back():
@@ -264,7 +273,7 @@ def test_the_ball_must_be_met_within_two_seconds():
     stroke.env.view.clock[:] = 58
     assert not stroke.step().terminated[0, 0]  # the end of step 59
     step = stroke.step()
-    assert step.terminated[0, 0] and not step.success[0] and not step.remaining_paid[0]
+    assert step.terminated[0, 0] and not step.success[0] and not paid_on(step)
     assert step.metrics["contact"][0] == 0 and step.metrics["error"][0].isnan()
     stroke = addressed()
     stroke.env.view.clock[:] = 59
@@ -281,7 +290,7 @@ def test_a_second_contact_of_the_club_is_a_foul(surface: int, foul: bool):
         stroke.ball((1.0, 0.0, 0.4), (12.0, 0.0, 4.0))
         step = stroke.step({surface: later}, at=(0.9, 0.0, 0.02135))
         assert bool(step.terminated[0, 0]) is too_late
-        assert bool(step.success[0]) is not too_late and not step.remaining_paid[0]
+        assert bool(step.success[0]) is not too_late and not paid_on(step)
         assert step.metrics["hit_rate"][0] == 1 - too_late and step.metrics["contact"][0] == 1
         assert bool(step.metrics["error"][0].isnan()) is too_late
 
@@ -342,11 +351,19 @@ def test_a_ball_at_rest_ends_the_episode_and_is_paid_on():
         steps = [stroke.step([TURF], at=(6.0, 0.0, 0.02135)) for _ in range(3)]
         assert [bool(s.terminated[0, 0]) for s in steps] == [False, False, rests]
         last = steps[-1]
-        assert bool(last.remaining_paid[0]) is rests and last.success[0]
+        assert paid_on(last) is rests and last.success[0]
         assert last.metrics["error"][0] == pytest.approx(math.dist((8, 1, 0.02135), (10, 0, 0)))
     # On its tee it waits for the club.
     stroke = addressed()
     assert not any(stroke.step([TEE]).terminated[0, 0] for _ in range(10))
+
+
+def test_a_ball_that_is_only_touched_is_not_hit():
+    """It stays on its tee, or comes to rest there."""
+    stroke = addressed()
+    steps = [stroke.step([HEAD] if k == 0 else []) for k in range(3)]
+    assert [bool(s.terminated[0, 0]) for s in steps] == [False, False, True]
+    assert not paid_on(steps[-1]) and not steps[-1].success[0]
 
 
 def test_a_ball_at_the_top_of_its_path_does_not_rest():
@@ -362,7 +379,7 @@ def test_a_foul_is_not_paid_on_by_rest():
     for _ in range(2):
         stroke.step([TURF], at=(6.0, 0.0, 0.02135))
     step = stroke.step([HEAD])
-    assert step.terminated[0, 0] and not step.remaining_paid[0] and not step.success[0]
+    assert step.terminated[0, 0] and not paid_on(step) and not step.success[0]
 
 
 def test_options_are_checked():
@@ -373,6 +390,76 @@ def test_options_are_checked():
     ):
         with pytest.raises(ValueError, match=words):
             make_env("golf", num_worlds=1, options=options)
+
+
+# Landings that the reward predicts.
+
+
+def test_a_landing_on_waves_is_the_first_touch():
+    """Independent: the flight every 2 ms, and the distance to the turf along its normal by finite
+    differences."""
+    n, size = 60, WAVES
+    generator = torch.Generator().manual_seed(5)
+    draw = torch.rand(n, 8, generator=generator)
+    phases = 2 * math.pi * draw[:, :2]
+    linvel = torch.stack((2 + 28 * draw[:, 2], 6 * draw[:, 3] - 3, 12 * draw[:, 4]), -1)
+    pos = torch.tensor((0.3, 0.0, 0.1)).repeat(n, 1)
+    spin = 200 * draw[:, 5:] - 100
+    where, when = landing_on_waves("golf", pos, linvel, spin, size, phases)
+    assert when.isfinite().all()
+    times = torch.arange(1, 2000) * 0.002
+    path = ball_path("golf", pos, linvel, spin, times.tolist()).double()
+    x, y, z = path.unbind(-1)
+
+    def height(x, y):
+        return turf_height(x, y, phases.double())
+
+    h = 1e-4
+    slope = (height(x + h, y) - height(x - h, y)) / (2 * h)
+    aside = (height(x, y + h) - height(x, y - h)) / (2 * h)
+    gap = z - height(x, y) - 0.02135 * (1 + slope**2 + aside**2).sqrt()
+    first = (gap <= 0).int().argmax(1)
+    late = times[first] - when
+    print(f"landings from {where[:, 0].min():.1f} to {where[:, 0].max():.1f} m")
+    assert (late > -1e-4).all() and (late < 0.0021).all()
+    world = torch.arange(n)
+    moved = (path[world, first] - where).norm(dim=1)
+    assert (moved < 0.0021 * 40).all()
+    some = draw[:, 0] < 0.5
+    masked, never = landing_on_waves("golf", pos, linvel, spin, size, phases, some)
+    assert torch.equal(masked[some], where[some]) and torch.equal(masked[~some], pos[~some])
+    assert never[~some].isinf().all()
+
+
+def test_a_landing_on_flat_turf_is_that_on_a_plane():
+    n = 20
+    draw = torch.rand(n, 6, generator=torch.Generator().manual_seed(6))
+    linvel = torch.stack((2 + 28 * draw[:, 0], 6 * draw[:, 1] - 3, 12 * draw[:, 2]), -1)
+    pos, spin = torch.tensor((0.3, 0.0, 0.1)).repeat(n, 1), 200 * draw[:, 3:] - 100
+    flat = (0.0, *WAVES[1:])
+    where, when = landing_on_waves("golf", pos, linvel, spin, flat, torch.zeros(n, 2))
+    plane, then = landing("golf", pos, linvel, spin, 0.02135)
+    torch.testing.assert_close(where, plane, rtol=0, atol=1e-3)
+    torch.testing.assert_close(when, then, rtol=0, atol=1e-4)
+
+
+def test_a_landing_on_waves_is_the_same_on_the_gpus_compiler():
+    wp = pytest.importorskip("warp")
+    wp.init()
+    n = 30
+    draw = torch.rand(n, 8, generator=torch.Generator().manual_seed(7))
+    phases = 2 * math.pi * draw[:, :2]
+    linvel = torch.stack((2 + 28 * draw[:, 2], 6 * draw[:, 3] - 3, 12 * draw[:, 4]), -1)
+    pos, spin = torch.tensor((0.3, 0.0, 0.1)).repeat(n, 1), 200 * draw[:, 5:] - 100
+    where, when = landing_on_waves("golf", pos, linvel, spin, WAVES, phases)
+    numbers = torch.tensor(BALLS["golf"].numbers(), dtype=torch.float32)
+    place, time = torch.empty(n, 3), torch.empty(n)
+    wanted = torch.ones(n, dtype=torch.bool)
+    given = (pos, linvel, spin, phases, *WAVES, 5.0, wanted, numbers, place, time)
+    inputs = [wp.from_torch(v) if isinstance(v, torch.Tensor) else v for v in given]
+    wp.launch(for_gpu().land_on_waves_worlds, dim=n, inputs=inputs, device="cpu")
+    torch.testing.assert_close(place, where, rtol=0, atol=1e-3)
+    torch.testing.assert_close(time, when, rtol=0, atol=1e-4)
 
 
 # Strokes in the engine.
