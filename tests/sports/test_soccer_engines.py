@@ -123,3 +123,32 @@ def test_another_engine_plays_the_same_game(task, name):
         assert (a.reward - b.reward).abs().max() < 0.01
         assert torch.equal(a.terminated, b.terminated)
     assert int(envs[1].physics.nan_worlds) == 0 and int(envs[1].physics.overflow) == 0
+
+
+def test_a_swung_leg_kicks_the_ball_in_both_mujocos():
+    """Back swing and kick with the right hip: the foot meets the ball, and no hand does."""
+    pytest.importorskip("mujoco_warp")
+    speeds = []
+    for name, options in (("mujoco", {"threads": 1}), ("warp", {"device": "cpu"})):
+        env = make_env(
+            "penalty_kick", engine=name, num_worlds=1, training=False, physics_options=options
+        )
+        scene = env.physics.scene
+        state = default_state(scene, 1, "cpu")
+        state.qpos[:, :2] = torch.tensor((3.7, 0.1))
+        env.physics.reset(torch.ones(1, dtype=torch.bool), state)
+        env.view.refresh()
+        env.memory = env.task.begin(env.view, {"target": torch.tensor([[16.0, 0.0, 0.5]])})
+        hip, knee = (scene.body.dof_index(f"R_{link}_y") for link in ("Hip", "Knee"))
+        paid = 0.0
+        for k in range(13):
+            action = torch.zeros(1, 1, 69)
+            action[..., hip] = 0.25 if k < 5 else -0.3
+            action[..., knee] = 0.25 if k < 5 else 0.0
+            result = env.step(action)
+            paid += float(result.terms["speed"][0, 0])
+        assert not result.terminated.any()
+        assert result.metrics["touched"][0] == 1.0 and result.metrics["handling"][0] == 0.0
+        speeds.append(env.physics.object_linvel[0, 0])
+        assert speeds[-1][0] > 2.0 and paid > 0.02
+    assert (speeds[0] - speeds[1]).abs().max() < 0.1
