@@ -25,7 +25,7 @@ SMALLEST = 2.6
 ARMS, HEAD, FEET = 0.85, 0.95, 1.05
 """An athlete reaches this far from its root: to the sides, up, down (m)."""
 BALL = 0.35
-"""Room around a ball (m)."""
+"""Least room around a ball or what else is thrown (m)."""
 INSET_ABOVE = 7.5
 """Where a picture is higher than this (m), a second one shows an athlete from near."""
 INSET_HEIGHT, INSET_SHARE = 2.9, 0.40
@@ -78,6 +78,17 @@ def things(scene: Scene) -> tuple[str, ...]:
     return tuple(o.name for o in scene.free_objects if "ball" in o.name or "javelin" in o.name)
 
 
+def reach(scene: Scene, name: str) -> float:
+    """How far an object reaches from its origin (m)."""
+    (found,) = (o for o in scene.objects if o.name == name)
+    far = 0.0
+    for shape in found.shapes:
+        size = math.hypot(*shape.size) if shape.kind == "box" else shape.size[0]
+        ends = [shape.center] if shape.end is None else [shape.center, shape.end]
+        far = max(far, size + max(math.hypot(*end) for end in ends))
+    return far
+
+
 def must_show(player: Player, frame: int, view: View, own: Stand | None = None) -> np.ndarray:
     """(K, 3) world points that a picture of a frame must hold; ``own``: another stand than the
     sport's."""
@@ -87,8 +98,8 @@ def must_show(player: Player, frame: int, view: View, own: Stand | None = None) 
     for p in player.roots()[frame]:
         points += [p + ARMS * right, p - ARMS * right, p + HEAD * z, p - FEET * z]
     for name in things(player.scene):
-        p = player.thing(name)[frame]
-        points += [p + s * BALL * axis for axis in (right, up) for s in (1, -1)]
+        p, room = player.thing(name)[frame], max(BALL, reach(player.scene, name))
+        points += [p + s * room * axis for axis in (right, up) for s in (1, -1)]
     own = own or stand(player.scene)
     points += [np.asarray(a) for a in own.anchors] if own else []
     points += list(player.targets(frame))

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from olympics_opt.camera import inset, must_show, shots, stand, things
+from olympics_opt.camera import inset, must_show, reach, shots, stand, things
 from olympics_opt.episode import Episode, Player, Window, decisive_window, touching
 from olympics_opt.moments import Event, chosen_frames, events, sheet_frames
 from olympics_opt.raycast import View, draw
@@ -29,6 +29,8 @@ PANEL, WIDE_PANEL = (480, 330), (640, 400)
 """Width and height of a panel (pixels), and of one that shows a field."""
 TRAIL = (190, 60, 30)
 """Colour of a ball's path."""
+SMALL = 5.0
+"""A ball of a smaller radius (pixels) gets a ring around it."""
 RULER_BELOW = math.radians(13.0)
 """Cameras tilted further than this see the ground, not the ruler behind the athlete."""
 
@@ -64,8 +66,8 @@ def picture(player: Player, frame: int, view: View, marks: Sequence[Mark], since
     image = Image.fromarray(draw(solids, view, marks, ground=player.ground, ruler=ruler))
     ink = ImageDraw.Draw(image)
     ways = [player.thing(name)[since : frame + 1] for name in things(player.scene)]
-    for way in ways:
-        _trail(ink, view, way)
+    for name, way in zip(things(player.scene), ways):
+        _trail(ink, view, way, reach(player.scene, name))
     close = inset(player, frame, view)
     if close is not None:
         small = Image.fromarray(draw(solids, close, marks, ground=player.ground, ruler=False))
@@ -77,17 +79,18 @@ def picture(player: Player, frame: int, view: View, marks: Sequence[Mark], since
     return image
 
 
-def _trail(ink: Any, view: View, path: np.ndarray) -> None:
-    """The way of a ball as dots, one a step, joined where it did not jump to a new place."""
+def _trail(ink: Any, view: View, path: np.ndarray, size: float) -> None:
+    """The way of a ball as dots, one a step, joined where it did not jump to a new place; a ring
+    around a ball of radius ``size`` (m) that is too small to be seen."""
     points = view.project(path)
     for i, (a, b) in enumerate(pairwise(points)):
         if np.linalg.norm(path[i + 1] - path[i]) < 2.0:
             ink.line((*a, *b), fill=TRAIL, width=1)
     for x, y in points[:-1]:
         ink.ellipse((x - 1.5, y - 1.5, x + 1.5, y + 1.5), fill=TRAIL)
-    if len(points):
+    if len(points) and size * view.scale < SMALL:
         x, y = points[-1]
-        r = 7.0
+        r = SMALL + 2.0
         ink.ellipse((x - r, y - r, x + r, y + r), outline=TRAIL, width=1)
 
 

@@ -85,10 +85,10 @@ _LOOKS = {
     "table_tennis": Look(courts.table_tennis, courts.table_tennis_props, _small_spot),
     "fencing": Look(courts.fencing),
     "boxing": Look(courts.boxing, courts.boxing_props),
-    "penalty_kick": Look(fields.penalty_kick, fields.goal_props, _bull),
-    "soccer": Look(fields.soccer, fields.goal_props),
-    "free_throw": Look(fields.free_throw, fields.free_throw_props),
-    "basketball": Look(fields.basketball, fields.basketball_props),
+    "penalty_kick": Look(fields.penalty_kick, fields.goal_nets, _bull),
+    "soccer": Look(fields.soccer, fields.goal_nets),
+    "free_throw": Look(fields.basketball, fields.baskets),
+    "basketball": Look(fields.basketball, fields.baskets),
 }
 
 
@@ -112,7 +112,7 @@ def terrain(scene: Scene, shown: Shown | None = None) -> Terrain | None:
     if not phases.size or not np.isfinite(phases).all():
         return None
     a, b = phases.reshape(-1, 2)[0].tolist()
-    for surface in getattr(scene, "surfaces", ()):
+    for surface in scene.surfaces:
         if surface.kind == "waves":
             return Terrain((a, b), *surface.size)
     return None

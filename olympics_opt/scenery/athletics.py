@@ -10,14 +10,13 @@ import math
 
 from olympics_opt.scenery.paint import PAINT, Mark, across, along, rectangle, slanted
 from sports import hurdling as rules
+from sports.javelin import HALF_FIELD, LINE_X
 from sports.scene import Scene
 
 TRACK, SAND, SAND_LINE, MAT, TURF = "#c9806a", "#e6d3a6", "#cdb684", "#7fa3c4", "#a9c99a"
 LINE = 0.05
 """Width of a track's lines (m)."""
 
-JAVELIN_LINE, JAVELIN_HALF_WIDTH = 2.0, 2.0
-"""x of the foul line and half the runway's width (m)."""
 ARC_RADIUS, SECTOR_ANGLE = 8.0, math.radians(28.96)
 """The sector's sides meet this far behind the foul line (m), at this angle (rad)."""
 SECTOR_LENGTH = 100.0
@@ -68,28 +67,28 @@ def hurdling(scene: Scene) -> list[Mark]:
 
 def javelin(scene: Scene) -> list[Mark]:
     """Runway, foul line, the sector's sides, and a line every ten metres from the foul line."""
-    apex = JAVELIN_LINE - ARC_RADIUS
+    apex = LINE_X - ARC_RADIUS
     slope = math.tan(SECTOR_ANGLE / 2)
 
     def half_width(x: float) -> float:
         return (x - apex) * slope
 
-    end = JAVELIN_LINE + SECTOR_LENGTH
-    first, last = half_width(JAVELIN_LINE), half_width(end)
-    field = ((JAVELIN_LINE, -first), (end, -last), (end, last), (JAVELIN_LINE, first))
+    end = LINE_X + SECTOR_LENGTH
+    first, last = half_width(LINE_X), half_width(end)
+    field = ((LINE_X, -first), (end, -last), (end, last), (LINE_X, first))
     marks = [
         Mark(field, TURF),
-        rectangle(-8.0, JAVELIN_LINE, -JAVELIN_HALF_WIDTH, JAVELIN_HALF_WIDTH, TRACK),
-        along(-JAVELIN_HALF_WIDTH - LINE / 2, -8.0, JAVELIN_LINE, LINE),
-        along(JAVELIN_HALF_WIDTH + LINE / 2, -8.0, JAVELIN_LINE, LINE),
+        rectangle(-8.0, LINE_X, -HALF_FIELD, HALF_FIELD, TRACK),
+        along(-HALF_FIELD - LINE / 2, -8.0, LINE_X, LINE),
+        along(HALF_FIELD + LINE / 2, -8.0, LINE_X, LINE),
     ]
     for side in (-1.0, 1.0):
-        start, stop = (JAVELIN_LINE, side * first), (end, side * last)
+        start, stop = (LINE_X, side * first), (end, side * last)
         marks.append(slanted(start, stop, LINE))
     for metre in range(10, int(SECTOR_LENGTH), 10):
-        x = JAVELIN_LINE + metre
+        x = LINE_X + metre
         marks.append(across(x, -half_width(x), half_width(x), 0.05, label=f"{metre} m"))
-    reach = max(JAVELIN_HALF_WIDTH, first) + 0.75
+    reach = max(HALF_FIELD, first) + 0.75
     # The rule book's line is 0.07 m wide, and its edge nearer to the sector counts.
-    marks.append(across(JAVELIN_LINE - 0.035, -reach, reach, 0.07, label="foul line"))
+    marks.append(across(LINE_X - 0.035, -reach, reach, 0.07, label="foul line"))
     return marks

@@ -8,7 +8,8 @@ the court (lines of 5 cm; three-point line 6.75 m from under the basket, 0.90 m 
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+
+import numpy as np
 
 from olympics_opt.scenery.paint import (
     PAINT,
@@ -21,50 +22,51 @@ from olympics_opt.scenery.paint import (
     rectangle,
     ring,
 )
-from olympics_opt.scenery.props import basket_net, box, has, net_box, prop, rod
+from olympics_opt.scenery.props import basket_net, box, net_box, prop, rod
+from sports.hoop import RING_RADIUS
+from sports.humanoid.body import Shape
+from sports.penalty_kick import SPOT
 from sports.scene import Scene, SceneObject
+from sports.soccer import GOAL_HALF_WIDTH, HALF_LENGTH, HALF_WIDTH
 
 LINE = 0.05
 
-# Football (m): half the field, the goal, the penalty area.
-FIELD_X, FIELD_Y, GOAL_Y, GOAL_Z = 16.0, 10.0, 2.0, 2.0
-CENTRE_CIRCLE, AREA, SPOT = 3.0, 6.0, 0.06
-PENALTY_SPOT_X = 4.0
-"""Of ``penalty_kick``: 12 m from the goal plane, as in the paper."""
+# Football (m): circle, penalty area, spot, the depth of a goal.
+CENTRE_CIRCLE, AREA, SPOT_RADIUS = 3.0, 6.0, 0.06
 GOAL_DEPTH = 1.0
 GRASS, MOWN, STRIPE = "#9cc48c", "#93bc83", 4.0
 
 # Basketball (m).
-COURT_X, COURT_Y = 14.5, 7.5
 RIM_TO_END = 1.575
 """From under the basket's centre to the end line."""
-RIM_Z, RIM_RADIUS = 3.05, 0.23
-THREE, THREE_Y = 6.75, COURT_Y - 0.90
+SIDE_Y = 7.5
+THREE, THREE_Y = 6.75, SIDE_Y - 0.90
 KEY_LENGTH, KEY_Y, CIRCLE, NO_CHARGE = 5.80, 2.45, 1.80, 1.25
-BOARD_GAP = 0.15
-"""From the rim's nearest edge to the board's face."""
-BOARD_Y, BOARD_BOTTOM, BOARD_TOP = 0.9, 2.90, 3.95
 SQUARE_Y, SQUARE_Z = 0.295, 0.45
 """The rectangle painted on the board: half its width, its height; its lower edge at the rim."""
-WOOD, KEY_PAINT = "#e3c79c", "#c98e6a"
+HALF_COURT = 14.5
+"""From the end line of a single basket to the middle of its court."""
+WOOD, AROUND, KEY_PAINT = "#e3c79c", "#d2b184", "#c98e6a"
 
 
 def _half_field() -> list[Mark]:
     """The marks of one half: penalty area, goal line between the posts, second half of lines."""
-    marks = [across(FIELD_X - AREA + LINE / 2, -GOAL_Y, GOAL_Y, LINE)]
+    marks = [across(HALF_LENGTH - AREA + LINE / 2, -GOAL_HALF_WIDTH, GOAL_HALF_WIDTH, LINE)]
     for s in (-1.0, 1.0):
         a, b = (math.pi / 2, math.pi) if s > 0 else (math.pi, 3 * math.pi / 2)
-        marks += ring(FIELD_X, s * GOAL_Y, AREA, LINE, start=a, end=b)
+        marks += ring(HALF_LENGTH, s * GOAL_HALF_WIDTH, AREA, LINE, start=a, end=b)
     return marks
 
 
 def _grass() -> list[Mark]:
-    marks = [rectangle(-FIELD_X - 3, FIELD_X + 3, -FIELD_Y - 3, FIELD_Y + 3, "#b3d3a4")]
-    marks.append(rectangle(-FIELD_X, FIELD_X, -FIELD_Y, FIELD_Y, GRASS))
-    for i in range(int(2 * FIELD_X / STRIPE)):
+    marks = [
+        rectangle(-HALF_LENGTH - 3, HALF_LENGTH + 3, -HALF_WIDTH - 3, HALF_WIDTH + 3, "#b3d3a4")
+    ]
+    marks.append(rectangle(-HALF_LENGTH, HALF_LENGTH, -HALF_WIDTH, HALF_WIDTH, GRASS))
+    for i in range(int(2 * HALF_LENGTH / STRIPE)):
         if i % 2:
-            x = -FIELD_X + i * STRIPE
-            marks.append(rectangle(x, x + STRIPE, -FIELD_Y, FIELD_Y, MOWN))
+            x = -HALF_LENGTH + i * STRIPE
+            marks.append(rectangle(x, x + STRIPE, -HALF_WIDTH, HALF_WIDTH, MOWN))
     return marks
 
 
@@ -72,48 +74,36 @@ def soccer(scene: Scene) -> list[Mark]:
     """Touch and goal lines, halfway line, centre circle and both penalty areas."""
     return [
         *_grass(),
-        *border(-FIELD_X, FIELD_X, -FIELD_Y, FIELD_Y, LINE),
-        across(0.0, -FIELD_Y, FIELD_Y, LINE),
+        *border(-HALF_LENGTH, HALF_LENGTH, -HALF_WIDTH, HALF_WIDTH, LINE),
+        across(0.0, -HALF_WIDTH, HALF_WIDTH, LINE),
         *ring(0.0, 0.0, CENTRE_CIRCLE, LINE),
-        disc(0.0, 0.0, SPOT, PAINT),
+        disc(0.0, 0.0, SPOT_RADIUS, PAINT),
         *mirrored(_half_field()),
     ]
 
 
 def penalty_kick(scene: Scene) -> list[Mark]:
     """The field with the spot from which the kick is taken."""
-    return [*soccer(scene), disc(PENALTY_SPOT_X, 0.0, 0.10, PAINT, "spot")]
+    return [*soccer(scene), disc(*SPOT, 0.10, PAINT)]
 
 
 def goal_nets(scene: Scene) -> list[SceneObject]:
-    """Nets behind the goal mouths that the scene has: both, or the one a penalty is shot at."""
-    if has(scene, "net"):
-        return []
-    sides = (1,) if scene.name == "penalty_kick" else (-1, 1)
+    """Nets behind the goals of the scene: at their backs, on top and on both sides."""
     found = []
-    for s in sides:
-        x, half = s * (FIELD_X + GOAL_DEPTH / 2), GOAL_DEPTH / 2
-        end = "east" if s > 0 else "west"
-        back = (s * (FIELD_X + GOAL_DEPTH), 0.0, GOAL_Z / 2)
-        found.append(net_box(f"{end}_back_net", back, (0.01, GOAL_Y, GOAL_Z / 2)))
-        found.append(net_box(f"{end}_top_net", (x, 0.0, GOAL_Z), (half, GOAL_Y, 0.01)))
-        for side, y in (("left", GOAL_Y), ("right", -GOAL_Y)):
-            name, size = f"{end}_{side}_net", (half, 0.01, GOAL_Z / 2)
-            found.append(net_box(name, (x, y, GOAL_Z / 2), size))
-    return found
-
-
-def goal_props(scene: Scene) -> list[SceneObject]:
-    """Nets, and posts and bars where the scene has none to draw."""
-    found = goal_nets(scene)
-    if has(scene, "post") or has(scene, "goal"):
-        return found
-    sides = (1,) if scene.name == "penalty_kick" else (-1, 1)
-    for s in sides:
-        x, y, z = s * FIELD_X, GOAL_Y + 0.05, GOAL_Z + 0.05
-        frame = [rod((x, t * y, 0.0), (x, t * y, z), 0.05) for t in (-1, 1)]
-        frame.append(rod((x, -y, z), (x, y, z), 0.05))
-        found.append(prop("east_goal" if s > 0 else "west_goal", "#f7f7f7", frame))
+    for goal in scene.objects:
+        if not goal.name.startswith("goal"):
+            continue
+        x, half, high = np.abs([[s.center, s.end] for s in goal.shapes]).max((0, 1))
+        s = np.sign(goal.shapes[0].center[0])
+        middle, depth = s * (x + GOAL_DEPTH / 2), GOAL_DEPTH / 2
+        back = (s * (x + GOAL_DEPTH), 0.0, high / 2)
+        found += [
+            net_box(f"{goal.name}_back_net", back, (0.01, half, high / 2)),
+            net_box(f"{goal.name}_top_net", (middle, 0.0, high), (depth, half, 0.01)),
+        ]
+        for side, y in (("a", half), ("b", -half)):
+            name, size = f"{goal.name}_{side}_net", (depth, 0.01, high / 2)
+            found.append(net_box(name, (middle, y, high / 2), size))
     return found
 
 
@@ -135,73 +125,55 @@ def _basket_half(rim_x: float) -> list[Mark]:
 
 
 def basketball(scene: Scene) -> list[Mark]:
-    """The whole court of 29 x 15 m."""
-    rim_x = COURT_X - RIM_TO_END
-    return [
-        rectangle(-COURT_X - 2, COURT_X + 2, -COURT_Y - 2, COURT_Y + 2, "#d2b184"),
-        rectangle(-COURT_X, COURT_X, -COURT_Y, COURT_Y, WOOD),
-        *mirrored(_basket_half(rim_x)),
-        *border(-COURT_X, COURT_X, -COURT_Y, COURT_Y, LINE),
-        across(0.0, -COURT_Y, COURT_Y, LINE),
-        *ring(0.0, 0.0, CIRCLE, LINE),
+    """The court around the scene's baskets: the whole of it for two, half of it for one."""
+    rims = [o.pos[0] for o in scene.objects if o.name.endswith("_ring")]
+    end = max(rims) + RIM_TO_END
+    start = -end if len(rims) > 1 else end - HALF_COURT
+    half = _basket_half(max(rims))
+    marks = [
+        rectangle(start - 2, end + 2, -SIDE_Y - 2, SIDE_Y + 2, AROUND),
+        rectangle(start, end, -SIDE_Y, SIDE_Y, WOOD),
+        *(mirrored(half) if len(rims) > 1 else half),
+        *border(start, end, -SIDE_Y, SIDE_Y, LINE),
     ]
+    if len(rims) > 1:
+        marks += [across(0.0, -SIDE_Y, SIDE_Y, LINE), *ring(0.0, 0.0, CIRCLE, LINE)]
+    return marks
 
 
-FREE_THROW_RIM_X = 4.5
-
-
-def free_throw(scene: Scene) -> list[Mark]:
-    """Half a court around a basket over x = 4.5; the line's far edge is then at x = 0.275."""
-    end = FREE_THROW_RIM_X + RIM_TO_END
-    half = end - COURT_X
-    return [
-        rectangle(half - 1, end + 2, -COURT_Y - 2, COURT_Y + 2, "#d2b184"),
-        rectangle(half, end, -COURT_Y, COURT_Y, WOOD),
-        *_basket_half(FREE_THROW_RIM_X),
-        *border(half, end, -COURT_Y, COURT_Y, LINE),
-    ]
-
-
-def _basket(x: float, tag: str, scene: Scene) -> list[SceneObject]:
-    """Cords, the square on the board and a post; rim and board where the scene has none."""
-    s = math.copysign(1.0, x)
-    face = x + s * (RIM_RADIUS + BOARD_GAP)
-    z = RIM_Z + SQUARE_Z / 2
-    front, edge = face - s * 0.004, 0.025
-    square = [
-        box((front, 0.0, RIM_Z), (0.003, SQUARE_Y, edge)),
-        box((front, 0.0, RIM_Z + SQUARE_Z), (0.003, SQUARE_Y, edge)),
-        *(box((front, t * SQUARE_Y, z), (0.003, edge, SQUARE_Z / 2)) for t in (-1, 1)),
-    ]
-    post_x, arm = face + s * 1.4, 3.3
-    post = [
-        rod((post_x, 0.0, 0.0), (post_x, 0.0, arm), 0.09),
-        rod((post_x, 0.0, arm), (face + s * 0.08, 0.0, arm + 0.1), 0.06),
-    ]
-    found = [
-        basket_net(f"cords{tag}", x, RIM_Z, RIM_RADIUS),
-        prop(f"square{tag}", "#c4452f", square),
-        prop(f"post{tag}", "#5a646e", post),
-    ]
-    if not has(scene, "board"):
-        size = (0.015, BOARD_Y, (BOARD_TOP - BOARD_BOTTOM) / 2)
-        board = box((face + s * 0.015, 0.0, (BOARD_TOP + BOARD_BOTTOM) / 2), size)
-        found.append(prop(f"board{tag}", "#f4f6f7", [board]))
-    if not has(scene, "rim"):
-        turns = [2 * math.pi * i / 16 for i in range(17)]
-        r, points = RIM_RADIUS + 0.01, []
-        points = [(x + r * math.cos(t), r * math.sin(t), RIM_Z) for t in turns]
-        hoop = [rod(a, b, 0.01) for a, b in pairwise(points)]
-        found.append(prop(f"rim{tag}", "#e0592b", hoop))
+def baskets(scene: Scene) -> list[SceneObject]:
+    """Of each of the scene's hoops: cords, the square on the board, and a post to hold it."""
+    found = []
+    objects = {o.name: o for o in scene.objects}
+    for name, hoop in objects.items():
+        if not name.endswith("_ring"):
+            continue
+        name = name.removesuffix("_ring")
+        board = objects[f"{name}_board"]
+        (plate,) = board.shapes
+        s = math.copysign(1.0, plate.center[0])
+        x, _, z = hoop.pos
+        face = board.pos[0] + plate.center[0] - s * plate.size[0]
+        found += [
+            basket_net(f"{name}_cords", x, z, RING_RADIUS),
+            prop(f"{name}_square", "#c4452f", _square(face - s * 0.003, z)),
+            prop(f"{name}_post", "#5a646e", _post(face, s)),
+        ]
     return found
 
 
-def basketball_props(scene: Scene) -> list[SceneObject]:
-    """Both baskets."""
-    rim_x = COURT_X - RIM_TO_END
-    return [*_basket(rim_x, "0", scene), *_basket(-rim_x, "1", scene)]
+def _square(x: float, z: float) -> list[Shape]:
+    """The rectangle on a board's face at ``x``, above the height ``z`` of the rim."""
+    edge, middle = 0.025, z + SQUARE_Z / 2
+    return [
+        box((x, 0.0, z), (0.003, SQUARE_Y, edge)),
+        box((x, 0.0, z + SQUARE_Z), (0.003, SQUARE_Y, edge)),
+        *(box((x, t * SQUARE_Y, middle), (0.003, edge, SQUARE_Z / 2)) for t in (-1, 1)),
+    ]
 
 
-def free_throw_props(scene: Scene) -> list[SceneObject]:
-    """The one basket."""
-    return _basket(FREE_THROW_RIM_X, "", scene)
+def _post(face: float, s: float) -> list[Shape]:
+    """A post behind the end line and an arm to the board, whose face is at ``face``."""
+    x, arm = face + s * 1.5, 3.3
+    start = (face + s * 0.08, 0.0, arm + 0.1)
+    return [rod((x, 0.0, 0.0), (x, 0.0, arm), 0.09), rod((x, 0.0, arm), start, 0.06)]

@@ -12,7 +12,7 @@ from typing import Literal
 
 from olympics_opt.scenery.paint import rgba
 from sports.humanoid.body import Shape
-from sports.scene import Scene, SceneObject
+from sports.scene import SceneObject
 
 Point = tuple[float, float, float]
 
@@ -55,11 +55,6 @@ def prop(
     return SceneObject(
         name, tuple(shapes), motion, pos, rgba=rgba(color, alpha), meets_ground=False
     )
-
-
-def has(scene: Scene, word: str) -> bool:
-    """Whether an object of the scene itself has ``word`` in its name."""
-    return any(word in o.name for o in scene.objects)
 
 
 def is_net(name: str) -> bool:

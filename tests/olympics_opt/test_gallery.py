@@ -10,9 +10,11 @@ import pytest
 
 from olympics_opt import gallery
 from olympics_opt.episode import Player
+from sports.humanoid.body import load_body
 from sports.registry import task_names
+from sports.scene import Scene, Start
 from tests.olympics_opt.episodes import bar_scene, jump
-from tests.olympics_opt.scenes import PLAIN, plain_scene, still, thrown
+from tests.olympics_opt.scenes import TASKS, scene_of, still, thrown
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -23,8 +25,9 @@ def pixels(path: Path) -> np.ndarray:
 
 def test_one_tile_for_each_task(tmp_path: Path) -> None:
     episodes = {"high_jump": jump(bar_scene(), "high_jump")}
-    episodes |= {name: still(plain_scene(name), 3) for name in PLAIN}
-    episodes["free_throw"] = thrown(plain_scene("free_throw"), (3.7, 0.0, 6.9), frames=20)
+    episodes |= {name: still(scene_of(name), 3) for name in TASKS}
+    episodes["a sport to come"] = still(Scene("any", load_body(), agents=(Start(), Start(2.0))), 3)
+    episodes["free_throw"] = thrown(scene_of("free_throw"), (3.7, 0.0, 6.9), frames=20)
     tile = (150, 100)
     path = gallery.contact_sheet(episodes, tmp_path / "all.png", tile=tile)
     found = pixels(path)
@@ -40,7 +43,7 @@ def test_one_tile_for_each_task(tmp_path: Path) -> None:
 
 
 def test_few_tasks_make_a_narrow_sheet(tmp_path: Path) -> None:
-    episodes = {name: still(plain_scene(name), 2) for name in ("fencing", "boxing")}
+    episodes = {name: still(scene_of(name), 2) for name in ("fencing", "boxing")}
     path = gallery.contact_sheet(episodes, tmp_path / "two.png", tile=(120, 80))
     assert pixels(path).shape == (80 + gallery.CAPTION, 240, 3)
     with pytest.raises(ValueError, match="at least one"):
@@ -74,6 +77,6 @@ def test_the_frame_shown_is_over_the_bar_or_what_matters_most() -> None:
     episode = jump(bar_scene(), "high_jump", takeoff=30)
     frame = gallery.highlight(Player(episode))
     assert abs(episode.qpos[frame, 0] - 20.0) < 0.3
-    kick = thrown(plain_scene("penalty_kick"), (14.0, -1.0, 3.0), start=25, frames=40)
+    kick = thrown(scene_of("penalty_kick"), (14.0, -1.0, 3.0), start=25, frames=40)
     assert abs(gallery.highlight(Player(kick)) - 24) <= 1
-    assert gallery.highlight(Player(still(plain_scene("fencing"), 9))) == 8
+    assert gallery.highlight(Player(still(scene_of("fencing"), 9))) == 8

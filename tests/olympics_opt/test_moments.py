@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from olympics_opt.episode import Player, Window, decisive_window
 from olympics_opt.moments import chosen_frames, events
-from tests.olympics_opt.scenes import plain_scene, still, thrown
+from tests.olympics_opt.scenes import scene_of, still, thrown
 
 
 def words(player: Player, word: str) -> list[int]:
@@ -14,7 +15,7 @@ def words(player: Player, word: str) -> list[int]:
 
 
 def test_a_kick_and_a_bounce_are_found_where_they_happen() -> None:
-    scene = plain_scene("penalty_kick")
+    scene = scene_of("penalty_kick")
     episode = thrown(scene, (5.0, 0.0, 3.0), start=10, frames=60)
     ball = scene.object_qpos("ball").start
     # The kicker's toe is at the ball when it leaves.
@@ -32,14 +33,14 @@ def test_a_kick_and_a_bounce_are_found_where_they_happen() -> None:
 
 
 def test_a_ball_that_lies_still_or_flies_freely_is_no_event() -> None:
-    scene = plain_scene("free_throw")
+    scene = scene_of("free_throw")
     episode = thrown(scene, (3.7, 0.0, 6.9), start=0, frames=30)  # in the air from the start
     assert not words(Player(episode), "ball:")
-    assert not events(Player(still(plain_scene("soccer_1v1"))))
+    assert not events(Player(still(scene_of("soccer_1v1"))))
 
 
 def test_a_ball_put_elsewhere_is_a_new_one_not_a_stroke() -> None:
-    scene = plain_scene("tennis")
+    scene = scene_of("tennis")
     episode = still(scene, 40)
     ball = scene.object_qpos("ball")
     episode.qpos[20:, ball.start] = 12.0
@@ -47,24 +48,24 @@ def test_a_ball_put_elsewhere_is_a_new_one_not_a_stroke() -> None:
     assert [(e.frame, e.word) for e in found] == [(20, "new ball")]
 
 
-def test_letting_go_of_a_ball_is_an_event() -> None:
-    scene = plain_scene("free_throw")
+@pytest.mark.parametrize(("name", "thing"), [("free_throw", "ball"), ("javelin", "javelin")])
+def test_letting_go_of_what_a_hand_holds_is_an_event(name: str, thing: str) -> None:
+    scene = scene_of(name)
     episode = still(scene, 50)
-    player = Player(episode)
-    hand = player.show(0).body("agent0/R_Hand").xpos.copy()
-    ball = scene.object_qpos("ball")
-    episode.qpos[:, ball.start : ball.start + 3] = hand + (0.0, 0.0, 0.13)
+    row = scene.object_qpos(thing).start
     for i in range(20, 50):  # slowly at first, so that no velocity jumps
         t = (i - 20) / 30
-        episode.qpos[i, ball.start] += 0.6 * t * t
-    assert words(Player(episode), "released") and not words(Player(episode), "ball:")
-    (frame,) = words(Player(episode), "released")
-    gone = 0.6 * ((frame - 20) / 30) ** 2
-    assert 0.05 < gone < 0.35
+        episode.qpos[i, row + 2] += 0.9 * t * t
+    found = events(Player(episode))
+    assert [e.word for e in found] == [f"{thing} released"]
+    gone = 0.9 * ((found[0].frame - 20) / 30) ** 2
+    assert 0.1 < gone < 0.5
+    # Held all the time, it is none.
+    assert not events(Player(still(scene, 50)))
 
 
 def test_hurdles_and_falls_and_rare_rewards_are_events() -> None:
-    scene = plain_scene("hurdling")
+    scene = scene_of("hurdling")
     episode = still(scene, 100)
     episode.qpos[:, 0] = np.linspace(0, 33, 100)
     episode.qpos[90:, 2] = 0.2
@@ -79,14 +80,14 @@ def test_hurdles_and_falls_and_rare_rewards_are_events() -> None:
 
 
 def test_falls_say_who() -> None:
-    scene = plain_scene("boxing")
+    scene = scene_of("boxing")
     episode = still(scene, 20)
     episode.qpos[12:, scene.agent_qpos(1).start + 2] = 0.2
     assert [(e.frame, e.word) for e in events(Player(episode))] == [(12, "1 falls")]
 
 
 def test_frames_are_the_ends_the_events_and_what_lies_between() -> None:
-    scene = plain_scene("tennis")
+    scene = scene_of("tennis")
     episode = still(scene, 300)
     ball = scene.object_qpos("ball")
     for i in (50, 130, 131, 250):

@@ -19,7 +19,7 @@ from sports.humanoid.body import load_body
 from sports.humanoid.mjcf import build_model
 from sports.scene import Scene
 from tests.olympics_opt.episodes import bar_scene, jump
-from tests.olympics_opt.scenes import PLAIN, plain_scene, still, thrown
+from tests.olympics_opt.scenes import TASKS, scene_of, still, thrown
 
 KINDS = {
     "box": [0.3, 0.2, 0.1],
@@ -224,7 +224,7 @@ def test_sheet_has_twelve_panels_for_each_recording(tmp_path: Path) -> None:
 def test_a_sheet_of_several_athletes_or_a_ball(name: str, tmp_path: Path) -> None:
     from PIL import Image
 
-    scene = plain_scene(name)
+    scene = scene_of(name)
     has_ball = any(o.name == "ball" for o in scene.objects)
     episode = thrown(scene, (7.0, 1.0, 4.0)) if has_ball else still(scene, 45)
     episode.shown = {"target": np.tile([[[-0.8, 0.3, 0.76]]], (45, 1, 1))}
@@ -240,7 +240,7 @@ def test_a_sheet_of_several_athletes_or_a_ball(name: str, tmp_path: Path) -> Non
 
 
 def test_the_ball_leaves_a_trail_and_its_way_is_not_drawn_through_a_new_serve() -> None:
-    scene = plain_scene("tennis")
+    scene = scene_of("tennis")
     flight = thrown(scene, (14.0, 0.0, 4.0), start=1, frames=20)
     player = episode_of.Player(flight)
     view = View(np.array([0.0, 0.0, 2.0]), math.pi / 2, 0.2, 16.0, 640, 400)
@@ -256,11 +256,11 @@ def test_the_ball_leaves_a_trail_and_its_way_is_not_drawn_through_a_new_serve() 
     assert (np.abs(jumped[y - 3 : y + 4, x - 3 : x + 4] - render.TRAIL).max(-1) > 40).all()
 
 
-@pytest.mark.parametrize("name", PLAIN)
+@pytest.mark.parametrize("name", TASKS)
 def test_the_decorated_model_keeps_the_state_and_touches_nothing(name: str) -> None:
-    scene, _ = dressed(plain_scene(name))
+    scene, _ = dressed(scene_of(name))
     model = decorated(scene)
-    plain = build_model(plain_scene(name))
+    plain = build_model(scene_of(name))
     assert (model.nq, model.nv, model.nmocap) == (plain.nq, plain.nv, plain.nmocap)
     for k in range(model.njnt):
         assert model.joint(k).name == plain.joint(k).name
@@ -280,7 +280,7 @@ def test_the_decorated_model_keeps_the_state_and_touches_nothing(name: str) -> N
 
 def test_the_decorated_waves_have_the_heights_of_the_formula() -> None:
     ground = Terrain((0.4, 1.9))
-    model = decorated(plain_scene("golf"), ground)
+    model = decorated(scene_of("golf"), ground)
     assert model.nhfield == 1
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

@@ -10,9 +10,10 @@ import pytest
 from olympics_opt import scenery
 from olympics_opt.scenery import Mark, Terrain, dressed, ground_marks, link_color, shape_colors
 from olympics_opt.scenery.golf import AREA_X, AREA_Y
+from sports.hoop import hoop
 from sports.humanoid.body import load_body
-from tests.olympics_opt.episodes import bar_scene
-from tests.olympics_opt.scenes import PLAIN, plain_scene
+from sports.scene import Scene
+from tests.olympics_opt.scenes import TASKS, scene_of
 
 WHITE = "#ffffff"
 FIELDS = {  # half extents (x, y) within which a sport's white lines lie, m
@@ -21,13 +22,12 @@ FIELDS = {  # half extents (x, y) within which a sport's white lines lie, m
     "boxing": (2.5, 2.5),
     "soccer_1v1": (16.0, 10.0),
     "penalty_kick": (16.0, 10.0),
-    "basketball_1v1": (14.5, 7.5),
 }
 
 
 def lines(name: str) -> list[np.ndarray]:
     """Corners (n, 2) of the white marks of a task."""
-    return [np.array(m.corners) for m in ground_marks(plain_scene(name)) if m.color == WHITE]
+    return [np.array(m.corners) for m in ground_marks(scene_of(name)) if m.color == WHITE]
 
 
 def has_line(name: str, x: tuple[float, float], y: tuple[float, float]) -> bool:
@@ -46,10 +46,9 @@ def turns(mark: Mark) -> np.ndarray:
     return edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
 
 
-@pytest.mark.parametrize("name", [*PLAIN, "high_jump"])
+@pytest.mark.parametrize("name", [*TASKS, "high_jump", "long_jump"])
 def test_marks_are_convex_polygons(name: str) -> None:
-    scene = plain_scene(name) if name in PLAIN else bar_scene()
-    marks = ground_marks(scene)
+    marks = ground_marks(scene_of(name))
     assert marks
     for mark in marks:
         turn = turns(mark)
@@ -77,7 +76,7 @@ def test_tennis_court_of_the_itf() -> None:
         assert has_line("tennis", (near, far), (-5.485, 5.485))
         assert has_line("tennis", (near, far), (-0.025, 0.025))
     assert has_line("tennis", (-6.40, 6.40), (-0.025, 0.025))
-    scene, _ = dressed(plain_scene("tennis"))
+    scene, _ = dressed(scene_of("tennis"))
     (posts,) = (o for o in scene.objects if o.name == "posts")
     assert {round(abs(s.center[1]), 3) for s in posts.shapes} == {5.029}
     (tape,) = (o for o in scene.objects if o.name == "tape")
@@ -85,7 +84,7 @@ def test_tennis_court_of_the_itf() -> None:
 
 
 def test_table_of_the_ittf_is_painted_on_its_top() -> None:
-    scene, _ = dressed(plain_scene("table_tennis_1v1"))
+    scene, _ = dressed(scene_of("table_tennis_1v1"))
     (paint,) = (o for o in scene.objects if o.name == "lines")
     low = np.min([np.subtract(s.center, s.size) for s in paint.shapes], axis=0)
     high = np.max([np.add(s.center, s.size) for s in paint.shapes], axis=0)
@@ -98,15 +97,22 @@ def test_table_of_the_ittf_is_painted_on_its_top() -> None:
 def test_piste_of_the_fie() -> None:
     for x in (-2.0, 2.0):
         assert has_line("fencing", (x - 0.02, x + 0.02), (-1.0, 1.0))
-    last = [m for m in ground_marks(plain_scene("fencing")) if m.color == "#cfb9ab"]
+    last = [m for m in ground_marks(scene_of("fencing")) if m.color == "#cfb9ab"]
     extents = sorted(np.ptp(np.array(m.corners)[:, 0]) for m in last)
     assert extents == pytest.approx([2.0, 2.0])
 
 
+def two_baskets() -> Scene:
+    """A court of 29 m: rims 1.575 m before its end lines."""
+    hoops = (*hoop("west", (-12.925, 0.0, 3.05), -1.0), *hoop("east", (12.925, 0.0, 3.05), 1.0))
+    return Scene("basketball_1v1", load_body(), objects=hoops)
+
+
 def test_basketball_court_of_fiba() -> None:
-    corners = lines("basketball_1v1")
-    rim = np.array([14.5 - 1.575, 0.0])
-    assert rim[0] == pytest.approx(12.925)
+    corners = [np.array(m.corners) for m in ground_marks(two_baskets()) if m.color == WHITE]
+    every = np.concatenate(corners)
+    assert np.abs(every).max(0) == pytest.approx([14.5, 7.5])
+    rim = np.array([12.925, 0.0])
     # The three-point line: outer edge 6.75 m from under the rim, then 0.90 m from the side line.
     away = [np.linalg.norm(c - rim, axis=1) for c in corners]
     arcs = [c for c, r in zip(corners, away) if np.isclose(r.max(), 6.75) and len(c) == 4]
@@ -117,11 +123,35 @@ def test_basketball_court_of_fiba() -> None:
     assert any(np.isclose(c[:, 0].min(), bend) for c in straight)
     # The free-throw line: its far edge 5.80 m from the end line; the key 4.90 m wide.
     line = 14.5 - 5.80
-    assert has_line("basketball_1v1", (line, line + 0.05), (-2.45, 2.45))
+    extents = [np.array([c.min(0), c.max(0)]) for c in corners]
+    want = np.array([[line, -2.45], [line + 0.05, 2.45]])
+    assert any(np.allclose(e, want) for e in extents)
+    assert any(np.allclose(e, -want[::-1]) for e in extents)  # and at the other end
     circle = [c for c in corners if np.isclose(np.linalg.norm(c, axis=1).max(), 1.80)]
     assert len(circle) == 48
     # Of the free throw: under a rim at x = 4.5 the same line is 0.275 m before the athlete.
     assert has_line("free_throw", (0.275, 0.325), (-2.45, 2.45))
+
+
+def test_cords_hang_from_the_ring_and_the_square_is_on_the_boards_face() -> None:
+    scene = two_baskets()
+    full, _ = dressed(scene)
+    props = {o.name: o for o in full.objects[len(scene.objects) :]}
+    assert set(props) == {
+        f"{end}_{x}" for end in ("west", "east") for x in ("cords", "square", "post")
+    }
+    for end, side in (("west", -1.0), ("east", 1.0)):
+        tops = np.array([s.center for s in props[f"{end}_cords"].shapes])
+        assert np.allclose(np.hypot(tops[:, 0] - side * 12.925, tops[:, 1]), 0.23)
+        assert (tops[:, 2] == 3.05).all()
+        face = side * (12.925 + 0.375)  # FIBA: 0.15 m behind the ring's inside, which is 0.225 m
+        for shape in props[f"{end}_square"].shapes:
+            assert 0.0 <= side * (face - shape.center[0]) < 0.005
+        low = min(s.center[2] - s.size[2] for s in props[f"{end}_square"].shapes)
+        assert low == pytest.approx(3.05, abs=0.03)
+        for shape in props[f"{end}_post"].shapes:  # behind the board, out of the ball's way
+            assert side * shape.center[0] > side * face and shape.end is not None
+            assert side * shape.end[0] > side * face
 
 
 def test_football_field_of_the_task() -> None:
@@ -131,19 +161,19 @@ def test_football_field_of_the_task() -> None:
     assert not [c for c in lines("soccer_2v2") if np.allclose(c.mean(0), (4.0, 0.0))]
     circle = [c for c in corners if np.isclose(np.linalg.norm(c, axis=1).max(), 3.0)]
     assert len(circle) == 48
-    scene, _ = dressed(plain_scene("soccer_2v2"))
+    scene, _ = dressed(scene_of("soccer_2v2"))
     nets = [o for o in scene.objects if scenery.is_net(o.name)]
     assert len(nets) == 8
     for net in nets:
         center, half = np.array(net.shapes[0].center), np.array(net.shapes[0].size)
-        assert (np.abs(center[0]) + half[0] >= 16.0) and np.abs(center[1]) <= 2.0
-        assert center[2] + half[2] <= 2.011
-    one, _ = dressed(plain_scene("penalty_kick"))
+        assert np.abs(center[0]) - half[0] >= 16.0  # behind the goal line
+        assert np.abs(center[1]) - half[1] <= 2.06 and center[2] - half[2] <= 2.06
+    one, _ = dressed(scene_of("penalty_kick"))
     assert len([o for o in one.objects if scenery.is_net(o.name)]) == 4
 
 
 def test_javelin_sector_of_world_athletics() -> None:
-    marks = ground_marks(plain_scene("javelin"))
+    marks = ground_marks(scene_of("javelin"))
     (foul,) = (m for m in marks if m.label == "foul line")
     assert np.array(foul.corners)[:, 0].max() == pytest.approx(2.0)
     (sector,) = (m for m in marks if m.color == "#a9c99a")
@@ -155,9 +185,7 @@ def test_javelin_sector_of_world_athletics() -> None:
 
 
 def test_hurdles_stand_on_their_ticks() -> None:
-    from sports.env import make_scene
-
-    scene = make_scene("hurdling")
+    scene = scene_of("hurdling")
     ticks = [m for m in ground_marks(scene) if m.color == "#3f6fa5"]
     at = sorted(float(np.mean(np.array(m.corners)[:, 0])) for m in ticks)
     assert at == pytest.approx(sorted(o.pos[0] for o in scene.objects))
@@ -192,8 +220,8 @@ def test_waves_are_those_of_the_formula() -> None:
 
 
 def test_props_leave_the_state_as_it_is_and_stand_where_the_target_is() -> None:
-    for name in PLAIN:
-        scene = plain_scene(name)
+    for name in TASKS:
+        scene = scene_of(name)
         target = np.array([[[1.0, 2.0, 0.3]], [[4.0, 5.0, 0.6]]])
         full, places = dressed(scene, {"target": target})
         assert full.nq == scene.nq and full.objects[: len(scene.objects)] == scene.objects
@@ -202,19 +230,19 @@ def test_props_leave_the_state_as_it_is_and_stand_where_the_target_is() -> None:
         if name in ("golf", "tennis", "table_tennis", "penalty_kick"):
             assert count > 0 and np.allclose(places[:, 0], target[:, 0])
     both = np.arange(12.0).reshape(2, 2, 3)
-    _, places = dressed(plain_scene("tennis_1v1"), {"target": both})
+    _, places = dressed(scene_of("tennis_1v1"), {"target": both})
     assert np.allclose(places, both)
-    assert dressed(plain_scene("tennis"), {})[1].shape[1] == 0
+    assert dressed(scene_of("tennis"), {})[1].shape[1] == 0
 
 
 def test_a_scene_of_no_sport_stays_bare() -> None:
-    scene = bar_scene()
-    assert dressed(scene)[0].objects == scene.objects
-    assert ground_marks(plain_scene("soccer_1v1")) == ground_marks(plain_scene("soccer_2v2"))
+    scene = Scene("any", load_body())
+    assert dressed(scene)[0].objects == () and ground_marks(scene) == []
+    assert ground_marks(scene_of("soccer_1v1")) == ground_marks(scene_of("soccer_2v2"))
 
 
 def test_teams_wear_shirts_and_tools_their_own_colours() -> None:
-    scene = plain_scene("soccer_2v2")
+    scene = scene_of("soccer_2v2")
     assert scenery.teams(scene) == (0, 0, 1, 1)
     own = [shape_colors(scene, agent) for agent in range(4)]
     assert own[0] == own[1] and own[2] == own[3]
@@ -223,7 +251,7 @@ def test_teams_wear_shirts_and_tools_their_own_colours() -> None:
         assert red[2] > red[0] and blue[0] > blue[2], link  # team 0 blue, team 1 red
     assert link_color("L_Hand", 0) != link_color("R_Hand", 0) != link_color("R_Toe", 0)
     golfer = load_body(equipment=("club",))
-    colors = shape_colors(plain_scene("golf", golfer), 0)
+    colors = shape_colors(Scene("any", golfer), 0)
     assert len(colors["R_Hand"]) == 2 and link_color("R_Hand") not in colors["R_Hand"]
-    player = shape_colors(plain_scene("tennis"), 0)["R_Wrist"]
+    player = shape_colors(scene_of("tennis"), 0)["R_Wrist"]
     assert player[0] == link_color("R_Wrist") and len(set(player)) == len(player) == 3
