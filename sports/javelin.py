@@ -65,7 +65,7 @@ def scene(config: Javelin, body: Body) -> Scene:
         contact_pairs=(("agent0", "javelin"), ("javelin", GROUND)),
         timestep=1.0 / 240.0,
         substeps=8,
-        sites={"start": (0.0, 0.0, 0.0), "line": (LINE_X, 0.0, 0.0)},
+        sites={"start": (0.0, 0.0, 0.0)},
     )
 
 

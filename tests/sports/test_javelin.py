@@ -239,6 +239,11 @@ def test_a_foot_beyond_the_line_is_a_foul_also_after_the_release():
         world.drop_to_ground("R_Toe")
         step = world.step(R_Toe=300.0, L_Toe=300.0)
         assert ended(step) is foul and step.metrics["foul"][0] == float(foul)
+        # Off the ground at both ends of a step and touched in between: it is all beyond the line.
+        world = Throw()
+        released(world)
+        world.place((1.95, 0.0, STANDING + 0.1))
+        assert ended(world.step(R_Toe=80.0)) and not ended(world.step(R_Ankle=80.0))
         # Above the ground it is none.
         world = Throw()
         released(world)
