@@ -65,7 +65,7 @@ def scene(config: Javelin, body: Body) -> Scene:
         contact_pairs=(("agent0", "javelin"), ("javelin", GROUND)),
         timestep=1.0 / 240.0,
         substeps=8,
-        sites={"start": (0.0, 0.0, 0.0), "line": (LINE_X, 0.0, 0.0)},
+        sites={"start": (0.0, 0.0, 0.0)},
     )
 
 
@@ -89,6 +89,7 @@ def begin(view: View, context: Memory) -> Memory:
         "x": view.physics.object_pos[:, 0, 0].clone(),
         "ends": ends,
         "speeds": speeds,
+        "fall": _fall(view, _nose(ends)),
         "released": zero > 0,
         "release_speed": torch.full_like(zero, torch.nan),
     }
@@ -129,7 +130,7 @@ def advance(view: View, memory: Memory) -> Advance:
     physics, root, clock = view.physics, view.root_pos[:, 0], view.clock
     grip, velocity, hand = physics.object_pos[:, 0], physics.object_linvel[:, 0], _palm(view)
     ends, speeds = _ends(view)
-    nose = (ends[:, 0] - ends[:, 1]) / (2 * END)
+    nose = _nose(ends)
 
     held, late = clock < HOLD_STEPS, clock >= THROW_STEPS
     aim = torch.where(late[:, None], _unit(velocity), constant(AIM, root.device))
@@ -160,7 +161,8 @@ def advance(view: View, memory: Memory) -> Advance:
     fell = view.fallen()[:, 0] & ~released
     failed = lost | clinging | foul | fell
 
-    mark, nose_first = _landing(memory["ends"], memory["speeds"], view.control_timestep)
+    before = memory["ends"], memory["speeds"], memory["fall"]
+    mark, nose_first = _landing(*before, view.control_timestep)
     distance = mark - LINE_X
     # What the hand still held when it came down was no throw: the release was seen before.
     success = landed & memory["released"] & ~failed & (distance > 0)
@@ -173,6 +175,7 @@ def advance(view: View, memory: Memory) -> Advance:
         "x": x.clone(),
         "ends": ends,
         "speeds": speeds,
+        "fall": _fall(view, nose),
         "released": released,
         "release_speed": nan_where(~released, speed),
     }
@@ -204,16 +207,38 @@ def _ends(view: View) -> tuple[Tensor, Tensor]:
     return physics.object_pos + arms, physics.object_linvel + swings
 
 
-def _landing(ends: Tensor, speeds: Tensor, timestep: float) -> tuple[Tensor, Tensor]:
+def _nose(ends: Tensor) -> Tensor:
+    """(N, 3) direction in which the javelin points."""
+    return (ends[:, 0] - ends[:, 1]) / (2 * END)
+
+
+def _fall(view: View, nose: Tensor) -> Tensor:
+    """(N, 3) acceleration (m/s^2) of the javelin in free flight: gravity and drag."""
+    assert JAVELIN.drag is not None
+    along_drag, across_drag = (k / JAVELIN.shapes[0].mass for k in JAVELIN.drag)
+    velocity = view.physics.object_linvel[:, 0]
+    speed = (velocity * nose).sum(-1, keepdim=True)
+    along = speed * nose
+    across = velocity - along
+    drag = along_drag * speed.abs() * along + across_drag * length(across)[:, None] * across
+    return constant((0.0, 0.0, -GRAVITY), nose.device) - drag
+
+
+def _landing(ends: Tensor, speeds: Tensor, fall: Tensor, timestep: float) -> tuple[Tensor, Tensor]:
     """(N,) x where the javelin meets the ground within a control step that began so, and whether
-    the nose comes first. The ends (N, 2, 3) fly on their parabolas: at 25 m/s a control step is
-    0.8 m long, and where the javelin is after it has bounced or slid says little."""
+    the nose comes first. The ends (N, 2, 3) fly on their parabolas of acceleration ``fall`` (N, 3):
+    at 25 m/s a control step is 0.8 m long, and where the javelin is after it has bounced or slid
+    says little."""
     x, _, z = ends.unbind(-1)
     forward, _, up = speeds.unbind(-1)
+    ahead, _, rise = fall[:, None].unbind(-1)
     drop = (z - JAVELIN_RADIUS).clamp(min=0.0)
-    time = (up + (up.square() + 2 * GRAVITY * drop).sqrt()) / GRAVITY
+    # The smaller root of drop + up t + rise t^2 / 2 = 0, whatever the sign of ``rise``.
+    root = (up.square() - 2 * rise * drop).clamp(min=0.0).sqrt()
+    time = 2 * drop / (root - up).clamp(min=1e-9)
     first = time.min(dim=1, keepdim=True)
-    met = torch.addcmul(x, forward, time.clamp(max=timestep))
+    time = time.clamp(max=timestep)
+    met = torch.addcmul(x, time, torch.addcmul(forward, time, ahead, value=0.5))
     return met.gather(1, first.indices)[:, 0], first.indices[:, 0] == 0
 
 

@@ -62,7 +62,7 @@ class SceneObject:
     it. The force on its centre of mass is ``-k |v| v`` of either part of its velocity."""
     holdable: bool = False
     """Whether hands can hold it: its contacts with athletes are then firm (``mjcf.HOLD_SOLREF``),
-    whatever ``solref`` says; in MuJoCo's usual ones friction creeps by centimetres a second."""
+    whatever ``solref`` says; in MuJoCo's usual ones a held javelin slides by 18 mm a second."""
 
     restitution: float | None = None
     """Of a ball (a free object of one sphere): share of the normal speed that it keeps when it hits

@@ -19,6 +19,11 @@ from sports.scene import Scene, SceneObject, Start
 
 JAVELIN_LENGTH, JAVELIN_RADIUS = 2.7, 0.0125
 """m; the men's javelin is 2.6 to 2.7 m long and 25 to 30 mm thick (World Athletics)."""
+AIR = 1.2
+"""kg/m^3"""
+SKIN_FRICTION, CYLINDER_DRAG = 0.004, 1.1
+"""Coefficients along a smooth rod (of its surface; turbulent) and across it (of its side view):
+textbook values. The force acts at the centre of mass: nothing turns the javelin in flight."""
 NOSE_UP = math.radians(30.0)
 _END = JAVELIN_LENGTH / 2 - JAVELIN_RADIUS
 JAVELIN = SceneObject(
@@ -29,6 +34,10 @@ JAVELIN = SceneObject(
     quat=(math.cos(NOSE_UP / 2), 0.0, -math.sin(NOSE_UP / 2), 0.0),
     friction=1.0,  # a cord grip in a dry hand
     rgba=(0.85, 0.85, 0.2, 1.0),
+    drag=(
+        0.5 * AIR * SKIN_FRICTION * 2.0 * math.pi * JAVELIN_RADIUS * JAVELIN_LENGTH,
+        0.5 * AIR * CYLINDER_DRAG * 2.0 * JAVELIN_RADIUS * JAVELIN_LENGTH,
+    ),
     holdable=True,
 )
 """The nose is at the end of its +x axis, the grip at the centre of mass."""
