@@ -5,12 +5,23 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from sports import free_throw, high_jump, hurdling, javelin, long_jump
+from sports import free_throw, high_jump, hurdling, javelin, long_jump, penalty_kick, soccer
 from sports.humanoid.body import load_body
 from sports.task import Task
 
-_ALL = (high_jump.TASK, long_jump.TASK, hurdling.TASK, javelin.TASK, free_throw.TASK)
-_TASKS: dict[str, Task] = {t.name: t for t in _ALL}
+_TASKS: dict[str, Task] = {
+    t.name: t
+    for t in (
+        high_jump.TASK,
+        long_jump.TASK,
+        hurdling.TASK,
+        javelin.TASK,
+        penalty_kick.TASK,
+        soccer.SOCCER_1V1,
+        soccer.SOCCER_2V2,
+        free_throw.TASK,
+    )
+}
 
 
 def task_names() -> tuple[str, ...]:

@@ -53,9 +53,40 @@ class SceneObject:
     """Whether the object collides with the ground plane."""
     solref: tuple[float, float] | None = None
     """MuJoCo contact reference (time constant s, damping ratio); None for the default."""
+    restitution: float | None = None
+    """Of a ball (a free object of one sphere): share of the normal speed that it keeps when it hits
+    anything, which it alone decides; None for the engine's own contact. Its ``friction`` is then
+    that with the ground. docs/physics.md says how the engines reach it."""
+    grip: float = 0.0
+    """Friction of such a ball with athletes. With other objects it has none."""
+    rolling: float = 0.0
+    """Rate at which such a ball loses speed as it rolls (1/s): from v it rolls v / rate far."""
     holdable: bool = False
     """Whether hands can hold it: its contacts with athletes are then firm (``mjcf.HOLD_SOLREF``),
-    whatever ``solref`` says; in MuJoCo's usual ones friction creeps by centimetres a second."""
+    whatever ``solref`` and ``restitution`` say; in MuJoCo's usual ones friction creeps by
+    centimetres a second."""
+
+    def __post_init__(self) -> None:
+        if self.restitution is None:
+            if self.grip or self.rolling:
+                raise ValueError(f"object '{self.name}': grip and rolling need a restitution")
+            return
+        if self.motion != "free" or [s.kind for s in self.shapes] != ["sphere"]:
+            raise ValueError(f"object '{self.name}': only a free ball of one sphere can bounce")
+        if not 0.0 < self.restitution < 1.0:
+            raise ValueError(
+                f"object '{self.name}': the restitution must be in (0, 1), not {self.restitution}"
+            )
+        if min(self.friction, self.grip, self.rolling) < 0.0 or max(self.friction, self.grip) >= 2:
+            raise ValueError(
+                f"object '{self.name}': friction and grip must be in [0, 2), rolling not negative"
+            )
+
+    def rolling_damping(self) -> float:
+        """Torque against its spin (N m s/rad) that slows a rolling ball at the rate ``rolling``:
+        (m + I / r^2) dv/dt = -damping v / r^2, with I = 2/5 m r^2 of a solid ball."""
+        (sphere,) = self.shapes
+        return self.rolling * 1.4 * sphere.mass * sphere.size[0] ** 2
 
 
 @dataclass(frozen=True)
@@ -104,6 +135,11 @@ class Scene:
     @property
     def free_objects(self) -> tuple[SceneObject, ...]:
         return tuple(o for o in self.objects if o.motion == "free")
+
+    @property
+    def bouncing(self) -> tuple[SceneObject, ...]:
+        """The balls with a restitution: they bounce and roll."""
+        return tuple(o for o in self.free_objects if o.restitution is not None)
 
     @property
     def mocap_objects(self) -> tuple[SceneObject, ...]:

@@ -3,13 +3,20 @@
 Gains act as ``stiffness = position servo limited to +-effort``, ``damping = passive joint
 damping``: a clamped damper inside the actuator stops damping and explodes (measured). Contact
 forces come from contact sensors (``netforce``): one per athlete link against the ground, then
-one per named pair of the scene, then (``Scene.link_contacts``) one per link against everything;
-then each athlete's ``WHOLE_SENSORS``. Three numbers each, world frame.
+one per named pair of the scene, then (``Scene.link_contacts``) one per link against everything,
+then one per bouncing ball against the ground; then each athlete's ``WHOLE_SENSORS``. Three numbers
+each, world frame.
 
 Contacts of athletes and ground yield to load (``CONTACT_IMPEDANCE``). With MuJoCo's default of
 0.9-0.95 a foot that has sunk in on impact is driven out again whatever it carries, so the ground
 does work: 0.16 m/s forward and 0.18 m/s up in 0.13 s of a sprint, more at a coarse time step.
 docs/physics.md has the measurements.
+
+A ball with a restitution decides by priority how it touches anything: a contact whose damping
+turns the approach v into -e v within one time step. A spring would take several, in which the ball
+sinks in. MuJoCo's friction pyramid has one damping for all directions, so that a ball which slides
+over the ground at 15 m/s would hop 1.8 m high: there the contact has no friction, and the engine
+adds Coulomb's after each step (``athletes.roll_ball``).
 """
 
 from __future__ import annotations
@@ -40,8 +47,11 @@ CONTACT_SOLIMP = (CONTACT_IMPEDANCE, CONTACT_IMPEDANCE, 0.001, 0.5, 2.0)
 HOLD_SOLREF, HOLD_IMPEDANCE = (1.0 / 120.0, 1.0), 0.99
 """Contacts of athletes with what they can hold: the least time constant at 1/240 s, critical
 damping, and so little yielding that a held javelin creeps by 0.2 mm/s."""
-# Collision classes: objects, the ground plane, athletes. What can be held has every shape twice:
-# one that meets athletes, one that meets the rest.
+BOUNCE_STIFFNESS, BOUNCE_IMPEDANCE = 144.0, 0.998
+"""Of a ball's contacts: acceleration per depth (1/s^2) and impedance. It lies 0.1 mm deep; at
+1/120 s one that arrives at 30 m/s, up to 25 cm deep when it is seen, gains 1 % from the spring."""
+# Collision classes: objects, the ground plane, athletes. What athletes meet in a way of their own
+# (to hold it, to grip it) has every shape twice: one that meets them, one that meets the rest.
 _SOLID, _GROUND, _ATHLETE, _REST = 1, 2, 4, 8
 
 
@@ -109,7 +119,28 @@ def _add_agent(spec: mujoco.MjSpec, scene: Scene, agent: int) -> None:
         spec.add_exclude(bodyname1=body_name(agent, a), bodyname2=body_name(agent, b))
 
 
-def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
+def is_bounce(solref: np.ndarray) -> np.ndarray:
+    """Which contact references (..., 2) of a compiled model are those of a ball's bounce; their
+    damping holds for one time step."""
+    return np.isclose(solref[..., 0], -BOUNCE_STIFFNESS * BOUNCE_IMPEDANCE**2)
+
+
+def _bounce(ball: SceneObject, timestep: float) -> dict[str, object]:
+    """Fields of a geom with the restitution of a ball, at a time step (s)."""
+    assert ball.restitution is not None
+    # On average a ball is first seen when it has gone half a time step deep: v h / 2.
+    spring = BOUNCE_STIFFNESS * timestep**2 / 2.0
+    damping = (1.0 + ball.restitution - spring) / timestep
+    return {
+        # MuJoCo divides these by the impedance, and gives the contact that share of them.
+        "solref": (-BOUNCE_STIFFNESS * BOUNCE_IMPEDANCE**2, -damping),
+        "solimp": (BOUNCE_IMPEDANCE, BOUNCE_IMPEDANCE, 0.001, 0.5, 2.0),
+        "priority": 1,
+        "condim": 1,
+    }
+
+
+def _add_object(spec: mujoco.MjSpec, obj: SceneObject, timestep: float) -> None:
     node = spec.worldbody.add_body(
         name=obj.name, pos=obj.pos, quat=obj.quat, mocap=obj.motion == "mocap"
     )
@@ -118,17 +149,23 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject) -> None:
     for shape in obj.shapes:
         fields: dict[str, object] = {
             "friction": (obj.friction, 0.005, 0.0001),
-            "contype": _REST if obj.holdable else _SOLID,
+            "contype": _REST if obj.holdable or obj.grip else _SOLID,
             "conaffinity": _SOLID | _REST | (_GROUND if obj.meets_ground else 0),
             "condim": 3,
             "rgba": obj.rgba,
         }
         if obj.solref is not None:
             fields["solref"] = obj.solref
+        if obj.restitution is not None:
+            fields |= _bounce(obj, timestep)
         _add_shape(node, shape, **fields)
-        if obj.holdable:
-            fields |= {"contype": 0, "conaffinity": _ATHLETE, "priority": 1, "solref": HOLD_SOLREF}
-            fields["solimp"] = (HOLD_IMPEDANCE, HOLD_IMPEDANCE, 0.001, 0.5, 2.0)
+        if obj.holdable or obj.grip:
+            fields |= {"contype": 0, "conaffinity": _ATHLETE, "priority": 1, "condim": 3}
+            if obj.restitution is not None:
+                fields["friction"] = (obj.grip, 0.005, 0.0001)
+            if obj.holdable:
+                fields["solref"] = HOLD_SOLREF
+                fields["solimp"] = (HOLD_IMPEDANCE, HOLD_IMPEDANCE, 0.001, 0.5, 2.0)
             _add_shape(node, replace(shape, mass=0.0), **fields)
 
 
@@ -176,6 +213,8 @@ def _add_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
             for link in scene.body.link_names:
                 name = body_name(agent, link)
                 add(f"all:{name}", (mujoco.mjtObj.mjOBJ_BODY, name), None)
+    for ball in scene.bouncing:
+        add(f"rolls:{ball.name}", (mujoco.mjtObj.mjOBJ_BODY, ball.name), ground)
     for agent in range(scene.num_agents):
         root = body_name(agent, scene.body.links[0].name)
         for kind in WHOLE_SENSORS:
@@ -216,7 +255,7 @@ def build_spec(scene: Scene, sensors: bool = True) -> mujoco.MjSpec:
     for i in range(scene.num_agents):
         _add_agent(spec, scene, i)
     for obj in scene.objects:
-        _add_object(spec, obj)
+        _add_object(spec, obj, scene.timestep)
     if sensors:
         _add_sensors(spec, scene)
     return spec
@@ -227,6 +266,9 @@ def build_model(scene: Scene | Body, sensors: bool = True) -> mujoco.MjModel:
     if isinstance(scene, Body):
         scene = humanoid_scene(scene)
     model = build_spec(scene, sensors).compile()
+    for ball in scene.bouncing:
+        first = model.joint(ball.name).dofadr[0]
+        model.dof_damping[first + 3 : first + 6] = ball.rolling_damping()
     if (model.nq, model.nv, model.nu) != (scene.nq, scene.nv, scene.nu):
         raise RuntimeError(f"scene '{scene.name}': compiled model has an unexpected layout")
     return model

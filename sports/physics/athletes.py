@@ -590,6 +590,40 @@ def show_object(
 
 
 @compiled
+def roll_ball(
+    force: np.ndarray,
+    timestep: np.ndarray,
+    friction: np.ndarray,
+    mass: float,
+    radius: float,
+    quat: np.ndarray,
+    qvel: np.ndarray,
+) -> None:
+    """Lets the ground's friction act on a ball after a time step, by Coulomb's law.
+
+    ``force`` (N, 3) of the ground on it in that step, ``timestep`` (N,), ``friction`` (N,),
+    ``quat`` (N, 4) and ``qvel`` (N, 6) of its free joint; writes to the last. The impulse is what
+    makes a solid ball roll (2/7 of its slip), or what friction can give.
+    """
+    for w in range(len(qvel)):
+        if not force[w, 2] > 0.0:
+            continue
+        axes = rotation(unit(quat[w, 0], quat[w, 1], quat[w, 2], quat[w, 3]))
+        spin = combine(axes, (qvel[w, 3], qvel[w, 4], qvel[w, 5]))
+        x, y = qvel[w, 0] - radius * spin[1], qvel[w, 1] + radius * spin[0]  # of the lowest point
+        slip = math.sqrt(x * x + y * y)
+        if not slip > 0.0:
+            continue
+        change = min(slip / 3.5, friction[w] * force[w, 2] * timestep[w] / mass)
+        x, y = -change / slip * x, -change / slip * y
+        qvel[w, 0] += x
+        qvel[w, 1] += y
+        turn = project(axes, (2.5 / radius * y, -2.5 / radius * x, 0.0))
+        for k in range(3):
+            qvel[w, 3 + k] += turn[k]
+
+
+@compiled
 def show_numbers(rows: np.ndarray, columns: np.ndarray, limit: float, bad: np.ndarray) -> bool:
     """Writes (N, k) to (k, N); sets ``bad`` (N,) where a number is not below a limit, or is NaN.
     Whether there was one."""

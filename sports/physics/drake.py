@@ -8,7 +8,8 @@ with Hunt-Crossley damping in Drake's convex solver, which is what makes agreeme
 Athletes come from :mod:`sports.humanoid.drake_plant`. Fixtures (``fixed`` and ``mocap``) are
 welded to the world through a frame whose pose is a parameter of the context, so that each world
 has its own; their velocity is zero, as it is for a mocap body in MuJoCo. ``solref`` of an object
-is a MuJoCo number and has no meaning here.
+is a MuJoCo number and has no meaning here. A ball's restitution comes from its stiffness: a soft
+contact loses little, a stiff one more, by a law of the time step alone.
 """
 
 # The stubs of Drake and MuJoCo type arrays, ports and modules more narrowly than they are.
@@ -26,7 +27,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import GeometryId
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, RigidBody
+from pydrake.multibody.tree import FixedOffsetFrame, QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context
 from torch import Tensor
 
@@ -39,6 +40,7 @@ from sports.humanoid.drake_plant import (
     add_humanoid,
     add_shapes,
     contact_properties,
+    drake_shape,
     filter_collisions,
     link_inertia,
     rotate,
@@ -49,6 +51,13 @@ from sports.scene import GROUND, Scene, SceneObject
 
 MAX_TIMESTEP = 1.0 / 480.0
 """Largest time step (s) chosen on its own: standing joints then follow MuJoCo to 1e-3 rad."""
+BOUNCE_TIMESTEP = 1.0 / 960.0
+"""The same of a scene with a ball that bounces, whose contact must be soft for its time step: at
+1/480 s a kick at 15 m/s would go through it."""
+BOUNCE_LOSS = 1.7
+"""Of Drake's discrete contact without dissipation: ``-ln(restitution) = BOUNCE_LOSS c`` where c is
+the time step times the contact's frequency sqrt(stiffness / mass), for c < 0.2 (measured in drops
+from 1 and 2 m; pi / 2 of an implicit Euler step, the rest is the ground's)."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +68,8 @@ class _Object:
     rigid: RigidBody
     frame: FixedOffsetFrame | None
     """Frame F of a fixture, whose X_WF is a context parameter; None for a free object."""
+    joint: QuaternionFloatingJoint | None
+    """Of a free object with the world: q = [quaternion wxyz, p_WB], v = [w_WB_W, v_WBo_W]."""
     quat: tuple[float, float, float, float]
 
 
@@ -66,8 +77,8 @@ class DrakePhysics:
     """The ``drake`` engine; see :class:`sports.physics.base.Physics` for the tensors.
 
     ``timestep`` (s) must divide the scene's control time step; None takes the scene's time step
-    divided by the smallest whole number that brings it to 1/480 s or below. Raises ValueError
-    for a time step that does not divide.
+    divided by the smallest whole number that brings it to 1/480 s or below, with a ball that
+    bounces to 1/960 s. Raises ValueError for a time step that does not divide.
     """
 
     engine = "drake"
@@ -99,7 +110,7 @@ class DrakePhysics:
         self._free: list[_Object] = []
         self._fixtures: list[_Object] = []
         for obj in scene.objects:
-            added = _add_object(plant, obj, points, shapes)
+            added = _add_object(plant, obj, self.timestep, points, shapes)
             (self._fixtures if added.frame is not None else self._free).append(added)
         plant.Finalize()
         filter_collisions(scene_graph, self._humanoids, [ground], points, shapes)
@@ -202,7 +213,7 @@ class DrakePhysics:
             p, quat = np.split(qpos[scene.object_qpos(obj.name)], [3])
             linear, spin = np.split(qvel[scene.object_qvel(obj.name)], [3])
             quat = quat / np.linalg.norm(quat)
-            start, start_v = _floating(obj.rigid)
+            start, start_v = _floating(obj.joint)
             q[start : start + 7] = (*quat, *p)
             v[start_v : start_v + 6] = (*rotate(quat, spin), *linear)
         self.plant.SetPositions(context, q)
@@ -300,7 +311,7 @@ class DrakePhysics:
                     self._q[:, humanoid.q_index], self._v[:, humanoid.v_index]
                 )
             for obj in self._free:
-                start, start_v = _floating(obj.rigid)
+                start, start_v = _floating(obj.joint)
                 quat = self._q[:, start : start + 4]
                 quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
                 w_W = self._v[:, start_v : start_v + 3]
@@ -349,7 +360,8 @@ class DrakePhysics:
 def _substeps(scene: Scene, timestep: float | None) -> int:
     """Drake steps in one control step."""
     if timestep is None:
-        return scene.substeps * math.ceil(scene.timestep / MAX_TIMESTEP - 1e-9)
+        largest = BOUNCE_TIMESTEP if scene.bouncing else MAX_TIMESTEP
+        return scene.substeps * math.ceil(scene.timestep / largest - 1e-9)
     count = round(scene.control_timestep / timestep) if timestep > 0 else 0
     if count < 1 or abs(count * timestep - scene.control_timestep) > 1e-9:
         raise ValueError(
@@ -362,33 +374,67 @@ def _substeps(scene: Scene, timestep: float | None) -> int:
 def _add_object(
     plant: MultibodyPlant,
     obj: SceneObject,
+    timestep: float,
     points: list[GeometryId],
     shapes: list[GeometryId],
 ) -> _Object:
     """Adds a scene object; its geometries are appended to ``points`` and ``shapes``."""
     instance = plant.AddModelInstance(obj.name)
     rigid = plant.AddRigidBody(obj.name, instance, link_inertia(obj.shapes))
-    frame = None
-    if obj.motion != "free":
+    frame, joint = None, None
+    if obj.motion == "free":
+        damping = obj.rolling_damping() if obj.rolling else 0.0
+        joint = QuaternionFloatingJoint(
+            obj.name, plant.world_frame(), rigid.body_frame(), angular_damping=damping
+        )
+        joint = plant.AddJoint(joint)
+    else:
         X_WF = RigidTransform(Quaternion(np.array(obj.quat, dtype=float)), np.array(obj.pos))
         frame = plant.AddFrame(FixedOffsetFrame(f"{obj.name}_fixture", plant.world_frame(), X_WF))
         plant.WeldFrames(frame, rigid.body_frame())
-    own = add_shapes(
-        plant,
-        rigid,
-        obj.name,
-        obj.shapes,
-        contact_properties(obj.friction, OBJECT_STIFFNESS, OBJECT_DISSIPATION),
-        ground=obj.motion == "free" and obj.meets_ground,
-    )
+    if obj.restitution is not None:
+        own = _add_ball(plant, rigid, obj, timestep)
+    else:
+        own = add_shapes(
+            plant,
+            rigid,
+            obj.name,
+            obj.shapes,
+            contact_properties(obj.friction, OBJECT_STIFFNESS, OBJECT_DISSIPATION),
+            ground=obj.motion == "free" and obj.meets_ground,
+        )
     points.extend(own[0])
     shapes.extend(own[1])
-    return _Object(obj.name, rigid, frame, obj.quat)
+    return _Object(obj.name, rigid, frame, joint, obj.quat)
 
 
-def _floating(rigid: RigidBody) -> tuple[int, int]:
-    """Where a free body's quaternion starts in q and its angular velocity in v."""
-    return rigid.floating_positions_start(), rigid.floating_velocities_start_in_v()
+def _add_ball(
+    plant: MultibodyPlant, rigid: RigidBody, ball: SceneObject, timestep: float
+) -> tuple[list[GeometryId], list[GeometryId]]:
+    """A ball that bounces: (sphere for the ground, sphere for the rest)."""
+    assert ball.restitution is not None
+    (sphere,) = ball.shapes
+    frequency = -math.log(ball.restitution) / (BOUNCE_LOSS * timestep)
+    stiffness = sphere.mass * frequency**2
+    X_BS, geometry = drake_shape(sphere)
+    # Drake combines two coefficients as 2 a b / (a + b), and the other surface has 1.
+    found = [
+        plant.RegisterCollisionGeometry(
+            rigid,
+            X_BS,
+            geometry,
+            f"{ball.name}_{against}",
+            contact_properties(friction / (2.0 - friction), stiffness, 0.0),
+        )
+        for against, friction in (("ground", ball.friction), ("rest", ball.grip))
+    ]
+    return found[:1], found[1:]
+
+
+def _floating(joint: QuaternionFloatingJoint | None) -> tuple[int, int]:
+    """Where a free object's quaternion starts in q and its angular velocity in v."""
+    assert joint is not None
+    return joint.position_start(), joint.velocity_start()
 
 
 __all__ = ["MAX_TIMESTEP", "DrakeHumanoid", "DrakePhysics"]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sports.humanoid.mjcf import CONTACT_SOLREF
+from sports.humanoid.mjcf import CONTACT_SOLREF, is_bounce
 
 _RANGES = ("friction", "stiffness", "damping", "contact_time", "contact_damping")
 _RANGES += ("contact_impedance",)
@@ -90,9 +90,12 @@ def contact_softness(
     solref: np.ndarray, solimp: np.ndarray, drawn: Draw
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N, geoms, 2) ``solref`` and (N, geoms, 5) ``solimp`` of every world: as drawn for athletes
-    and ground, else the model's (geoms, 2) and (geoms, 5)."""
+    and ground, else the model's (geoms, 2) and (geoms, 5). A ball bounces in one time step, however
+    long that of its world is."""
     yields = np.all(np.isclose(solref, CONTACT_SOLREF), axis=-1)[None, :, None]
     softness = np.stack((drawn.contact_time, drawn.contact_damping), axis=-1)[:, None]
     impedance = np.repeat(solimp[None], len(drawn.contact_impedance), axis=0)
     impedance[..., :2] = drawn.contact_impedance[:, None, None]
-    return np.where(yields, softness, solref[None]), np.where(yields, impedance, solimp[None])
+    own = np.repeat(solref[None], len(drawn.stride), axis=0)
+    own[..., 1] /= np.where(is_bounce(solref), drawn.stride[:, None], 1)
+    return np.where(yields, softness, own), np.where(yields, impedance, solimp[None])

@@ -38,12 +38,14 @@ def _sum_contacts(
     geom_link: wp.array(dtype=int),  # type: ignore[valid-type]
     side_a: wp.array2d(dtype=int),  # type: ignore[valid-type]
     side_b: wp.array2d(dtype=int),  # type: ignore[valid-type]
+    geom_ball: wp.array(dtype=int),  # type: ignore[valid-type]
     num_links: int,
     others: int,
     forces: wp.array3d(dtype=float),  # type: ignore[valid-type]
 ):
     """Adds each contact's force (on its second geom, world frame) to its link and pairs, and
-    from slot ``others`` on (if positive) to links that met something else than the ground."""
+    from slot ``others`` on (if positive) to links that met something else than the ground; the
+    ground's on a geom with a slot of its own in ``geom_ball`` there."""
     i = wp.tid()
     if i >= count[0]:
         return
@@ -58,6 +60,10 @@ def _sum_contacts(
     if second == -2 and first >= 0:
         for k in range(3):
             wp.atomic_add(forces, world, first, k, -f[k])
+    if first == -2 and geom_ball[pair[1]] >= 0:
+        wp.atomic_add(forces, world, geom_ball[pair[1]], 2, f[2])
+    if second == -2 and geom_ball[pair[0]] >= 0:
+        wp.atomic_add(forces, world, geom_ball[pair[0]], 2, -f[2])
     if others > 0 and first != -2 and second != -2:
         for k in range(3):
             if second >= 0:
@@ -71,6 +77,42 @@ def _sum_contacts(
         if side_a[pair[0], p] == 1 and side_b[pair[1], p] == 1:
             for k in range(3):
                 wp.atomic_add(forces, world, num_links + p, k, -f[k])
+
+
+@wp.kernel
+def _roll(
+    forces: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    slot: int,
+    timestep: wp.array(dtype=float),  # type: ignore[valid-type]
+    friction: wp.array(dtype=float),  # type: ignore[valid-type]
+    mass: float,
+    radius: float,
+    q: int,
+    v: int,
+    qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
+):
+    """``athletes.roll_ball`` for one world; same formulas. ``q``, ``v``: where the ball's positions
+    and velocities begin."""
+    w = wp.tid()
+    load = forces[w, slot, 2]
+    turn = wp.quat_to_matrix(
+        wp.normalize(wp.quat(qpos[w, q + 4], qpos[w, q + 5], qpos[w, q + 6], qpos[w, q + 3]))
+    )
+    spin = turn @ wp.vec3(qvel[w, v + 3], qvel[w, v + 4], qvel[w, v + 5])
+    x = qvel[w, v] - radius * spin[1]
+    y = qvel[w, v + 1] + radius * spin[0]
+    slip = wp.sqrt(x * x + y * y)
+    if load > 0.0 and slip > 0.0:
+        step = timestep[w % timestep.shape[0]]
+        change = wp.min(slip / 3.5, friction[w] * load * step / mass)
+        x = -change / slip * x
+        y = -change / slip * y
+        qvel[w, v] = qvel[w, v] + x
+        qvel[w, v + 1] = qvel[w, v + 1] + y
+        local = wp.transpose(turn) @ wp.vec3(2.5 / radius * y, -2.5 / radius * x, 0.0)
+        for k in range(3):
+            qvel[w, v + 3 + k] = qvel[w, v + 3 + k] + local[k]
 
 
 @wp.kernel
@@ -270,8 +312,11 @@ class WarpPhysics:
             self.m.opt.warn_overflow = 0  # counted below, never printed
             self.d = mjw.make_data(model, nworld=n, nconmax=contacts, njmax=rows)
             self._timesteps = [self.m.opt.timestep] * scene.substeps
+            factor = np.ones(n)
             if variation is not None:
-                self._vary(draw(variation, n, scene.substeps, variation_seed))
+                drawn = draw(variation, n, scene.substeps, variation_seed)
+                factor = drawn.friction
+                self._vary(drawn)
         view = wp.to_torch
         d = self.d
         self.qpos, self.qvel = view(d.qpos), view(d.qvel)
@@ -291,12 +336,20 @@ class WarpPhysics:
 
         geom_link, side_a, side_b = _contact_tables(scene, model)
         pairs = len(scene.contact_pairs)
-        sensors = k + pairs + k * scene.link_contacts
+        links_end = self._first_ball = k + pairs + k * scene.link_contacts
+        sensors = links_end + len(scene.bouncing)
+        geom_ball = np.full(model.ngeom, -1, dtype=np.int32)
+        for i, ball in enumerate(scene.bouncing):
+            geom_ball[model.geom_bodyid == model.body(ball.name).id] = links_end + i
         self._others = k + pairs if scene.link_contacts else 0
         with wp.ScopedDevice(self._wp_device):
             self._geom_link = wp.array(geom_link, dtype=int)
             self._side_a = wp.array(side_a, dtype=int)
             self._side_b = wp.array(side_b, dtype=int)
+            self._geom_ball = wp.array(geom_ball, dtype=int)
+            self._ball_friction = [
+                wp.array(np.full(n, ball.friction) * factor, dtype=float) for ball in scene.bouncing
+            ]
             self._contact_ids = wp.array(np.arange(self.d.naconmax), dtype=int)
             self._contact_force = wp.zeros(self.d.naconmax, dtype=wp.spatial_vector)
             self._now = wp.zeros((n, sensors, 3), dtype=float)
@@ -319,7 +372,7 @@ class WarpPhysics:
         self.ground_force = self._forces[:, :k].unflatten(1, (agents, links))
         self.link_force = torch.zeros(0, agents, links, 3, device=self.device)
         if scene.link_contacts:
-            self.link_force = self._forces[:, k + pairs :].unflatten(1, (agents, links))
+            self.link_force = self._forces[:, k + pairs : links_end].unflatten(1, (agents, links))
         self._pairs = slice(k, k + pairs)
         self.bad = torch.zeros(n, dtype=torch.bool, device=self.device)
         self.nan_worlds = torch.zeros((), dtype=torch.long, device=self.device)
@@ -439,11 +492,13 @@ class WarpPhysics:
                     self._geom_link,
                     self._side_a,
                     self._side_b,
+                    self._geom_ball,
                     self._split,
                     self._others,
                 ],
                 outputs=[self._now],
             )
+            self._roll_balls(self._timesteps[i])
             wp.launch(
                 _keep_largest,
                 dim=self._largest.shape,
@@ -454,6 +509,26 @@ class WarpPhysics:
             if last:
                 self._refresh()
             self._correct(self._timesteps[i], last)
+
+    def _roll_balls(self, timestep: wp.array) -> None:
+        for i, ball in enumerate(self.scene.bouncing):
+            (sphere,) = ball.shapes
+            wp.launch(
+                _roll,
+                dim=self.num_worlds,
+                inputs=[
+                    self._now,
+                    self._first_ball + i,
+                    timestep,
+                    self._ball_friction[i],
+                    sphere.mass,
+                    sphere.size[0],
+                    self.scene.object_qpos(ball.name).start,
+                    self.scene.object_qvel(ball.name).start,
+                    self.d.qpos,
+                    self.d.qvel,
+                ],
+            )
 
     def _correct(self, timestep: wp.array, last: bool) -> None:
         cinert, *changed = self._kept

@@ -1,6 +1,6 @@
 """The worlds of the ``mujoco`` engine: a batch of C MuJoCo and what is done around it.
 
-A control step is ``substeps`` calls of the batch, the momentum kept after each.
+A control step is ``substeps`` calls of the batch; after each, balls roll and momentum is kept.
 """
 
 from __future__ import annotations
@@ -12,14 +12,43 @@ import numpy as np
 from mujoco.batch import Batch
 
 from sports.humanoid.mjcf import body_name
-from sports.physics.athletes import Tree, finish_athlete, look_at_contacts
+from sports.physics.athletes import Tree, finish_athlete, look_at_contacts, roll_ball
 from sports.physics.momentum import AthleteKeeper
 from sports.physics.results import Results, show, show_state
 from sports.physics.variation import Draw, contact_softness
-from sports.scene import Scene
+from sports.scene import Scene, SceneObject
 
 TOO_MUCH = 1e30
 """Squared contact forces (N^2) from here on are no forces: the world has diverged."""
+
+
+class _Ball:
+    """A ball that bounces and rolls in N worlds."""
+
+    def __init__(self, model: mujoco.MjModel, ball: SceneObject, num_worlds: int) -> None:
+        (sphere,) = ball.shapes
+        joint, sensor = model.joint(ball.name), model.sensor(f"rolls:{ball.name}")
+        first = joint.qposadr[0] + 3
+        self._quat = slice(first, first + 4)
+        self._qvel = slice(joint.dofadr[0], joint.dofadr[0] + 6)
+        self._force = slice(sensor.adr[0], sensor.adr[0] + 3)
+        self._mass, self._radius = sphere.mass, sphere.size[0]
+        self.friction = np.full(num_worlds, ball.friction)
+        """(N,) with the ground."""
+
+    def roll(
+        self, timestep: np.ndarray, sensors: np.ndarray, qpos: np.ndarray, qvel: np.ndarray
+    ) -> None:
+        """The ground's friction after a time step (N,)."""
+        roll_ball(
+            sensors[:, self._force],
+            timestep,
+            self.friction,
+            self._mass,
+            self._radius,
+            qpos[:, self._quat],
+            qvel[:, self._qvel],
+        )
 
 
 class Worlds:
@@ -50,6 +79,7 @@ class Worlds:
         self._constraint, self._sensors = batch.bind("qfrc_constraint"), batch.bind("sensordata")
         sensors = out.ground_force.shape[1] + len(out.pair_force) + out.link_force.shape[1]
         self._peaks = np.zeros((n, sensors))
+        self._balls = [_Ball(model, ball, n) for ball in scene.bouncing]
         self._timesteps: list[np.ndarray] | None = None
         self._softness = model.geom_solref, model.geom_solimp
         if drawn is not None:
@@ -72,6 +102,8 @@ class Worlds:
                     keeper.kept.timestep[:] = self._timesteps[i]
             self.batch.step()
             look_at_contacts(self._sensors, self._peaks, *forces, TOO_MUCH)
+            for ball in self._balls:
+                ball.roll(self.keepers[0].kept.timestep, self._sensors, self.qpos, self.qvel)
             if i < self.scene.substeps - 1:
                 for keeper in self.keepers:
                     keeper.correct(current=False)
@@ -128,6 +160,8 @@ class Worlds:
         """Gives each world its own numbers; see the ``warp`` engine."""
         expand = self.batch.expand
         expand("geom_friction")[:, :, 0] *= drawn.friction[:, None]
+        for ball in self._balls:
+            ball.friction *= drawn.friction
         softness = contact_softness(*self._softness, drawn)
         expand("geom_solref")[:], expand("geom_solimp")[:] = softness
         expand("actuator_gainprm")[:, :, 0] *= drawn.stiffness[:, None]
