@@ -227,10 +227,15 @@ def _shape(row: dict[str, str]) -> Shape:
 FINGERS = ("Index", "Middle", "Pinky", "Ring", "Thumb")
 
 
+def is_finger(link: str) -> bool:
+    """Whether a link is a part of a finger. Fingers meet objects and nothing else (the palms meet
+    bodies and ground): a third of a flailing athlete's contacts were those of its own fingers."""
+    return link.removeprefix("L_").removeprefix("R_").startswith(FINGERS)
+
+
 def strength_group(link: str) -> str:
     """Row of the human strength table for a link: side dropped, all fingers together."""
-    name = link.removeprefix("L_").removeprefix("R_")
-    return "Finger" if name.startswith(FINGERS) else name
+    return "Finger" if is_finger(link) else link.removeprefix("L_").removeprefix("R_")
 
 
 @cache

@@ -58,7 +58,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from sports.humanoid.body import Body, Shape, support_points
+from sports.humanoid.body import Body, Shape, is_finger, support_points
 
 POINT_RADIUS = 1e-4
 """Radius (m) of the sphere that stands for a box corner against the ground."""
@@ -96,7 +96,7 @@ class DrakeHumanoid:
     actuators: tuple[JointActuator, ...]
     """In the order of ``body.dofs``."""
     points: tuple[tuple[GeometryId, ...], ...]
-    """Per link: spheres that touch the ground only."""
+    """Per link: spheres that touch the ground only; none for fingers."""
     shapes: tuple[tuple[GeometryId, ...], ...]
     """Per link: the true shapes, which touch everything but the ground."""
 
@@ -291,7 +291,14 @@ def add_humanoid(plant: MultibodyPlant, body: Body, name: str = "athlete") -> Dr
             actuator.set_controller_gains(PdControllerGains(p=dof.kp, d=0.0))
         actuators.append(actuator)
     geometry = [
-        add_shapes(plant, links[link.name], link.name, link.shapes, contact_properties())
+        add_shapes(
+            plant,
+            links[link.name],
+            link.name,
+            link.shapes,
+            contact_properties(),
+            ground=not is_finger(link.name),
+        )
         for link in body.links
     ]
     return DrakeHumanoid(
@@ -353,8 +360,8 @@ def filter_collisions(
     """Explicit filters: points meet ``ground`` only, shapes everything but ``ground``.
 
     Shapes of one link, and of the pairs in ``body.excluded_pairs``, never meet; different
-    athletes do, and so do athletes and objects. The massless bodies between two links defeat
-    Drake's own adjacent-body filter, so nothing is left to it.
+    athletes do, and so do athletes and objects; fingers meet objects only. The massless bodies
+    between two links defeat Drake's own adjacent-body filter, so nothing is left to it.
     """
     points = [g for h in humanoids for link in h.points for g in link] + list(object_points)
     shapes = [g for h in humanoids for link in h.shapes for g in link] + list(object_shapes)
@@ -363,6 +370,15 @@ def filter_collisions(
     declare.ExcludeWithin(GeometrySet(points))
     declare.ExcludeBetween(GeometrySet(points), GeometrySet(shapes))
     declare.ExcludeBetween(GeometrySet(shapes), GeometrySet(ground))
+    fingers = [
+        g
+        for h in humanoids
+        for link, own in zip(h.body.links, h.shapes)
+        if is_finger(link.name)
+        for g in own
+    ]
+    athletes = [g for h in humanoids for own in h.shapes for g in own]
+    declare.ExcludeBetween(GeometrySet(fingers), GeometrySet(athletes))
     for humanoid in humanoids:
         body = humanoid.body
         for own in humanoid.shapes:

@@ -26,7 +26,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from sports.humanoid.body import Body, Shape
+from sports.humanoid.body import Body, Shape, is_finger
 from sports.scene import GROUND, Scene, SceneObject, humanoid_scene
 
 _KIND = {
@@ -50,9 +50,10 @@ damping, and so little yielding that a held javelin creeps by 0.2 mm/s."""
 BOUNCE_STIFFNESS, BOUNCE_IMPEDANCE = 144.0, 0.998
 """Of a ball's contacts: acceleration per depth (1/s^2) and impedance. It lies 0.1 mm deep; at
 1/120 s one that arrives at 30 m/s, up to 25 cm deep when it is seen, gains 1 % from the spring."""
-# Collision classes: objects, the ground plane, athletes. What athletes meet in a way of their own
-# (to hold it, to grip it) has every shape twice: one that meets them, one that meets the rest.
-_SOLID, _GROUND, _ATHLETE, _REST = 1, 2, 4, 8
+# Collision classes: objects, the ground plane, athletes, their fingers (which meet objects only).
+# What athletes meet in a way of their own (to hold it, to grip it) has every shape twice: one that
+# meets them, one that meets the rest.
+_SOLID, _GROUND, _ATHLETE, _FINGER, _REST = 1, 2, 4, 8, 16
 
 
 def body_name(agent: int, link: str) -> str:
@@ -81,14 +82,15 @@ def _add_agent(spec: mujoco.MjSpec, scene: Scene, agent: int) -> None:
         bodies[link.name] = node
         if link.parent is None:
             node.add_freejoint(name=f"agent{agent}/root")
+        finger = is_finger(link.name)
         for k, shape in enumerate(link.shapes):
             _add_shape(
                 node,
                 shape,
                 name=f"{body_name(agent, link.name)}:{k}",
                 friction=(friction, 0.005, 0.0001),
-                contype=_ATHLETE,
-                conaffinity=_SOLID | _GROUND | _ATHLETE,
+                contype=_FINGER if finger else _ATHLETE,
+                conaffinity=_SOLID if finger else _SOLID | _GROUND | _ATHLETE,
                 condim=3,
                 solref=CONTACT_SOLREF,
                 solimp=CONTACT_SOLIMP,
@@ -160,7 +162,8 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject, timestep: float) -> None:
             fields |= _bounce(obj, timestep)
         _add_shape(node, shape, **fields)
         if obj.holdable or obj.grip:
-            fields |= {"contype": 0, "conaffinity": _ATHLETE, "priority": 1, "condim": 3}
+            fields |= {"contype": 0, "conaffinity": _ATHLETE | _FINGER}
+            fields |= {"priority": 1, "condim": 3}
             if obj.restitution is not None:
                 fields["friction"] = (obj.grip, 0.005, 0.0001)
             if obj.holdable:

@@ -15,6 +15,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from sports.humanoid.body import is_finger
 from sports.humanoid.mjcf import body_name, build_model
 from sports.physics.base import GRAVITY, NO_FORCE, Geometry, PhysicsState, diverged
 from sports.physics.variation import Draw, Variation, contact_softness, draw
@@ -305,8 +306,10 @@ class WarpPhysics:
         if ids != list(range(1, len(ids) + 1)):
             raise RuntimeError(f"scene '{scene.name}': athletes and balls are not listed first")
 
-        rows = scene.rows_per_world or 100 + 4 * links * agents + 48 * len(scene.free_objects)
-        contacts = scene.contacts_per_world or 40 + (links * agents) // 2
+        # Fingers meet objects only: a flailing SMPL-X athlete with a javelin took 96 rows at most.
+        solid = agents * sum(not is_finger(link) for link in scene.body.link_names)
+        rows = scene.rows_per_world or 100 + 4 * solid + 48 * len(scene.free_objects)
+        contacts = scene.contacts_per_world or 40 + solid // 2
         with wp.ScopedDevice(self._wp_device):
             self.m = mjw.put_model(model)
             self.m.opt.warn_overflow = 0  # counted below, never printed

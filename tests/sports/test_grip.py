@@ -12,12 +12,12 @@ import torch
 from sports import quaternion
 from sports.env import make_env
 from sports.humanoid import load_body
-from sports.humanoid.body import Shape
+from sports.humanoid.body import Shape, is_finger
 from sports.humanoid.grip import DATA, prove, try_hold
 from sports.humanoid.hold import BASKETBALL, HELD, load_hold
 from sports.humanoid.mjcf import CONTACT_SOLREF, HOLD_SOLREF, build_model
 from sports.physics import default_state, make_physics
-from sports.scene import GROUND, Scene, SceneObject
+from sports.scene import GROUND, Scene, SceneObject, Start
 
 HOLDS = ("javelin", "basketball")
 PLACES = {"javelin": (0.24, -0.59, 1.61), "basketball": (0.35, 0.0, 1.5)}
@@ -224,4 +224,35 @@ def test_the_ground_can_be_a_side_of_a_pair(engine):
     assert abs(touched[0] - first) <= 1
     assert float(forces[-1][0]) == pytest.approx(0.8 * 9.81, rel=0.05)
     assert all(float(force[1]) == 0.0 for force in forces)
+    physics.close()
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "drake"])
+def test_fingers_meet_objects_and_nothing_else(engine):
+    """Face down, the left hand on the ground, the right one on a box."""
+    body = load_body("smplx")
+    lying = Start(z=0.3, pose={"L_Shoulder_z": -0.5, "R_Shoulder_z": 0.1})
+    plate = Shape("box", (0.0, 0.0, 0.0), (0.3, 0.3, 0.1), 5.0)
+    box = SceneObject("box", (plate,), "fixed", (0.43, -0.9, 0.1))
+    scene = Scene(
+        "lie",
+        body,
+        agents=(lying,),
+        objects=(box,),
+        contact_pairs=tuple((f"agent0/{link}", "box") for link in body.link_names),
+    )
+    physics = make_physics(engine, scene, 1)
+    state = default_state(scene, 1, "cpu")
+    state.qpos[:, 3:7] = torch.tensor((math.cos(math.pi / 4), 0.0, math.sin(math.pi / 4), 0.0))
+    physics.reset(torch.ones(1, dtype=torch.bool), state)
+    on_ground, on_box = set(), set()
+    for _ in range(30):
+        physics.step(torch.zeros(1, scene.nu))
+        ground, pairs = physics.ground_force[0, 0].norm(dim=-1), physics.pair_force[0]
+        on_ground |= {body.link_names[i] for i in ground.nonzero()[:, 0]}
+        on_box |= {body.link_names[i] for i in pairs.nonzero()[:, 0]}
+    fingers = {link for link in body.link_names if is_finger(link)}
+    assert len(fingers) == 30
+    assert "L_Wrist" in on_ground and not on_ground & fingers
+    assert on_box & fingers
     physics.close()

@@ -228,7 +228,7 @@ def test_running_out_with_the_javelin_ends_the_throw():
 
 
 def test_a_foot_beyond_the_line_is_a_foul_also_after_the_release():
-    """The right toe of the standing athlete: from the body table, hip to toe and half its length."""
+    """The toes of the standing athlete: from the body table, hip to toe and half its length."""
     toe = -0.0213 - 0.0168 - 0.0202 + 0.119 + 0.0158 + 0.0495
     left = -0.026 - 0.0094 - 0.0319 + 0.1182 + 0.0256 + 0.0495
     furthest = max(toe, left)
