@@ -91,8 +91,8 @@ def _key(rim_x: float, side: float) -> list[Mark]:
 
 
 def _free_throw() -> list[Mark]:
-    end = free_throw.RIM_X + 1.575
-    return [*_frame(end - 14.0, end, -7.5, 7.5, WOOD), *_key(free_throw.RIM_X, 1.0)]
+    end = free_throw.RIM[0] + 1.575
+    return [*_frame(end - 14.0, end, -7.5, 7.5, WOOD), *_key(free_throw.RIM[0], 1.0)]
 
 
 _MARKS = {

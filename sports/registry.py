@@ -5,7 +5,16 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from sports import free_throw, high_jump, hurdling, javelin, long_jump, penalty_kick, soccer
+from sports import (
+    basketball,
+    free_throw,
+    high_jump,
+    hurdling,
+    javelin,
+    long_jump,
+    penalty_kick,
+    soccer,
+)
 from sports.humanoid.body import load_body
 from sports.task import Task
 
@@ -20,6 +29,8 @@ _TASKS: dict[str, Task] = {
         soccer.SOCCER_1V1,
         soccer.SOCCER_2V2,
         free_throw.TASK,
+        basketball.BASKETBALL_1V1,
+        basketball.BASKETBALL_2V2,
     )
 }
 
