@@ -137,14 +137,18 @@ class Render:
     """Draw a policy: a video of its best episode, or a sheet of 12 frames of best and median.
 
     The sheet needs no GL library; the video needs EGL or OSMesa unless ``--renderer software``.
+    ``--all --out sheet.png`` draws every task on one picture instead.
     """
 
-    name: Positional[Annotated[str, arg(metavar="TASK")]]
+    name: Positional[Annotated[str, arg(metavar="TASK")]] = ""
     """Sport; see ``olympics-opt list``."""
-    policy: str
+    policy: str = ""
     """A run folder, a policy file, or ``pretrained[:ALGO[-STRENGTH]]``."""
+    all: bool = False
+    """Every task on one picture: an episode of the shipped policy where there is one, else the
+    start."""
     out: Path | None = None
-    """mp4 file for the video."""
+    """mp4 file for the video; with ``--all`` a png file."""
     sheet: Path | None = None
     """png file for the sheet."""
     renderer: Literal["gl", "software"] = "gl"
@@ -157,6 +161,33 @@ class Render:
     """Seed of all randomness."""
     processes: int = 2
     """Worker processes for the ``drake`` engine."""
+    strength: Literal["paper", "human"] | None = None
+    """Strength of the athlete; by default the one the policy was trained with."""
+    limits: Literal["paper", "anatomical"] | None = None
+    """Joint ranges; by default those the policy was trained with."""
+
+
+@dataclass(frozen=True)
+class Play:
+    """Watch a policy at work: in MuJoCo's viewer, or in a browser where there is no display.
+
+    In the viewer space pauses, - and = change the speed, the right arrow steps and backspace
+    begins a new episode. The browser gets a page with a 3-D replay, from this machine alone.
+    """
+
+    name: Positional[Annotated[str, arg(metavar="TASK")]]
+    """Sport; see ``olympics-opt list``."""
+    policy: str = ""
+    """A run folder, a policy file, ``pretrained[:ALGO[-STRENGTH]]``, ``zero`` or ``random``; by
+    default the policy that is shipped, else ``zero``."""
+    viewer: Literal["mujoco", "browser"] | None = None
+    """By default ``mujoco`` where there is a display."""
+    out: Path | None = None
+    """html file for the page, instead of serving it."""
+    port: int = 8000
+    """Of the browser's page; 0 takes a free one."""
+    seed: int = 0
+    """Seed of all randomness."""
     strength: Literal["paper", "human"] | None = None
     """Strength of the athlete; by default the one the policy was trained with."""
     limits: Literal["paper", "anatomical"] | None = None
@@ -227,13 +258,14 @@ COMMANDS: dict[str, Command] = {
     "evaluate": Command(Evaluate, "olympics_opt.play:run_evaluate", "task"),
     "verify": Command(Verify, "olympics_opt.verify:run_verify", "task"),
     "render": Command(Render, "olympics_opt.play:run_render", "task"),
+    "play": Command(Play, "olympics_opt.viewer:run_play", "task"),
     "study": Command(Study, "olympics_opt.study:run_study"),
     "bench": Command(
         None, "olympics_opt.bench:main", summary="Measure physics, environment and training speed."
     ),
     "leaderboard": Command(Leaderboard, "olympics_opt.catalogue:run_leaderboard"),
 }
-LATER = ("mocap", "play")
+LATER = ("mocap",)
 """Commands of later versions: not listed, refused with a sentence."""
 USER_ERRORS = (ValueError, RuntimeError, OSError, ImportError)
 

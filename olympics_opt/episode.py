@@ -1,11 +1,12 @@
 """Recorded episodes as pictures need them: states put into a model, the part that decides.
 
-Shared by the sheet of frames (`render.py`) and the video (`video.py`).
+Shared by the sheet of frames (`render.py`), the video (`video.py`) and the camera (`camera.py`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,7 +14,8 @@ import mujoco
 import numpy as np
 
 from olympics_opt.raycast import Solid
-from olympics_opt.scenery import complete_qpos, link_color, rgb
+from olympics_opt.scenery import complete_qpos, dressed, is_net, rgb, shape_colors, terrain
+from olympics_opt.scenery.props import MESH
 from sports.humanoid.mjcf import body_name, build_model
 from sports.scene import Scene
 
@@ -52,27 +54,44 @@ class Window:
 
 
 class Player:
-    """Puts an episode's frames into a MuJoCo model, one at a time."""
+    """Puts an episode's frames into a MuJoCo model, one at a time.
 
-    def __init__(self, episode: Episode, model: mujoco.MjModel | None = None) -> None:
+    ``scene`` is the episode's with its props. ``build`` makes the model of it.
+    """
+
+    def __init__(
+        self, episode: Episode, build: Callable[[Scene], mujoco.MjModel] = build_model
+    ) -> None:
         self.episode = episode
-        self.scene = scene = episode.scene
-        self.model = model if model is not None else build_model(scene)
+        shown = getattr(episode, "shown", {})
+        self.scene, places = dressed(episode.scene, shown)
+        self.ground = terrain(episode.scene, shown)
+        scene = self.scene
+        self.model = build(scene)
         self.data = mujoco.MjData(self.model)
         self.qpos = complete_qpos(scene, episode.qpos)
-        mocap = getattr(episode, "mocap_pos", None)
-        count = len(scene.mocap_objects)
-        if mocap is None or np.size(mocap) == 0:
-            mocap = np.broadcast_to(scene.default_mocap_pos(), (len(self.qpos), count, 3))
-        self.mocap = np.asarray(mocap, dtype=float)
+        mocap = np.asarray(getattr(episode, "mocap_pos", np.zeros(0)), dtype=float)
+        if mocap.size == 0:
+            mocap = episode.scene.default_mocap_pos()[None]
+        count = len(self.qpos)
+        self.mocap = np.concatenate([_lasting(x, count) for x in (mocap, places)], axis=1)
+        """(T, M, 3) positions of the fixtures, the props among them last."""
+        self._targets = places.shape[1]
         self._rows = [self.model.body(o.name).mocapid[0] for o in scene.mocap_objects]
+        own = [shape_colors(scene, agent) for agent in range(scene.num_agents)]
         colors = {
-            self.model.body(body_name(agent, name)).id: rgb(link_color(name))
-            for agent in range(scene.num_agents)
-            for name in scene.body.link_names
+            self.model.geom(f"{body_name(agent, link)}:{k}").id: rgb(color)
+            for agent, links in enumerate(own)
+            for link, shapes in links.items()
+            for k, color in enumerate(shapes)
         }
-        self._colors = [
-            colors.get(int(self.model.geom_bodyid[g]), tuple(self.model.geom_rgba[g][:3]))
+        nets = {self.model.body(o.name).id for o in scene.objects if is_net(o.name)}
+        self._looks = [
+            (
+                colors.get(g, tuple(self.model.geom_rgba[g][:3])),
+                float(self.model.geom_rgba[g][3]),
+                MESH if int(self.model.geom_bodyid[g]) in nets else 0.0,
+            )
             for g in range(self.model.ngeom)
         ]
 
@@ -102,11 +121,24 @@ class Player:
                 data.geom_xpos[g].copy(),
                 data.geom_xmat[g].reshape(3, 3).copy(),
                 model.geom_size[g][: names[int(model.geom_type[g])][1]],
-                self._colors[g],
+                *self._looks[g],
             )
             for g in range(model.ngeom)
             if int(model.geom_type[g]) in names
         ]
+
+    def roots(self) -> np.ndarray:
+        """(T, A, 3) where the athletes are."""
+        slices = [self.scene.agent_qpos(agent) for agent in range(self.scene.num_agents)]
+        return np.stack([self.qpos[:, s][:, :3] for s in slices], axis=1)
+
+    def targets(self, frame: int) -> np.ndarray:
+        """(K, 3) where the props at targets stand."""
+        return self.mocap[frame, self.mocap.shape[1] - self._targets :]
+
+    def thing(self, name: str) -> np.ndarray:
+        """(T, 3) where a moving object is."""
+        return self.qpos[:, self.scene.object_qpos(name)][:, :3]
 
     def lowest(self, frame: int) -> float:
         """Height of the lowest point of the first athlete (m)."""
@@ -125,6 +157,11 @@ class Player:
                 )
             low = min(low, data.geom_xpos[g][2] - reach)
         return low
+
+
+def _lasting(table: np.ndarray, count: int) -> np.ndarray:
+    """(count, K, 3) of a table (T, K, 3) with as many rows, or with one that lasts."""
+    return table if len(table) == count else np.broadcast_to(table[:1], (count, *table.shape[1:]))
 
 
 def touching(episode: Episode, frame: int) -> list[str]:

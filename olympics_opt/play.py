@@ -169,6 +169,10 @@ def run_render(config: Render) -> int:
     from olympics_opt.render import render_sheet, render_video
     from rl import provenance
 
+    if config.all:
+        return _render_all(config)
+    if not config.name or not config.policy:
+        raise ValueError("give a task and --policy, or --all --out sheet.png for every task")
     if config.out is None and config.sheet is None:
         raise ValueError("give --out FILE.mp4 for a video, --sheet FILE.png for a sheet, or both")
     for path, suffix in ((config.out, ".mp4"), (config.sheet, ".png")):
@@ -185,6 +189,18 @@ def run_render(config: Render) -> int:
         written.append(render_video(best, config.out, renderer=config.renderer, progress=True))
     for path in written:
         print(f"wrote {path}")
+    return 0
+
+
+def _render_all(config: Render) -> int:
+    """``render --all``. Raises ValueError for what does not go with it."""
+    from olympics_opt.gallery import render_all
+
+    if config.name or config.policy or config.sheet is not None:
+        raise ValueError("--all draws every task: give no task, no --policy and no --sheet")
+    if config.out is None or config.out.suffix.lower() != ".png":
+        raise ValueError("give --all a picture to write: --out sheet.png")
+    print(f"wrote {render_all(config.out, config.seed)}")
     return 0
 
 

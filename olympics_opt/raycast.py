@@ -1,25 +1,28 @@
 """A small software renderer: every pixel is a ray, every shape is intersected exactly.
 
 It needs numpy only, so pictures exist on machines without any GL library. Shapes are the four
-of the body table (box, sphere, capsule, cylinder) over a ground plane with painted marks, a
-one-metre grid and the shadows of a high sun. World frame z up; m; colours are linear 0..1.
+of the body table (box, sphere, capsule, cylinder) over the ground (a plane, or golf's waves) with
+painted marks, a grid and the shadows of a high sun. Some shapes are seen through: nets are drawn
+as their meshes. World frame z up; m; colours are linear 0..1.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from olympics_opt.scenery import Mark, rgb
+from olympics_opt.scenery import Mark, Terrain, rgb
 
 SUN = np.array([-0.28, -0.42, 0.86]) / np.linalg.norm([-0.28, -0.42, 0.86])
 SKY_HIGH, SKY_LOW = np.array(rgb("#c9dcec")), np.array(rgb("#f4f7fa"))
 GROUND = np.array(rgb("#dfe4e6"))
-FOG = 0.02
-"""Fading of the ground grid and marks with distance (1/m)."""
+FAR = 250.0
+"""Rays start this far before the picture plane (m)."""
+STRIDE = 0.2
+"""Horizontal steps in which a ray looks for the first wave in its way (m)."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,11 @@ class Solid:
     """(3, 3) R_WS."""
     size: np.ndarray
     color: tuple[float, float, float]
+    alpha: float = 1.0
+    """Opacity; what is behind a shape with less than 1 shines through."""
+    mesh: float = 0.0
+    """Width of a net's meshes (m): a box is drawn as strings that far apart, in a veil of its
+    opacity. 0 for a closed surface."""
 
     @property
     def radius(self) -> float:
@@ -62,6 +70,8 @@ class View:
     """Metres from the lower to the upper edge."""
     width_px: int
     height_px: int
+    horizon: float = 6.0
+    """The ground ends this far behind the target (m): seen in parallel it has no horizon."""
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -94,6 +104,11 @@ class View:
         x = (np.arange(self.width_px)[cols] + 0.5 - self.width_px / 2) / self.scale
         y = (self.height_px / 2 - np.arange(self.height_px)[rows] - 0.5) / self.scale
         return self.target + x[None, :, None] * right + y[:, None, None] * up
+
+
+def grid_step(view: View) -> float:
+    """Distance of the lines of the ground's grid and of the ruler (m): 1, 5 or 10."""
+    return 1.0 if view.scale >= 40 else 5.0 if view.scale >= 8 else 10.0
 
 
 def _ball(o: np.ndarray, d: np.ndarray, center: float, radius: float) -> np.ndarray:
@@ -166,38 +181,102 @@ def _box(view: View, centers: np.ndarray, radius: float) -> tuple[slice, slice] 
     return (slice(y0, y1), slice(x0, x1)) if x0 < x1 and y0 < y1 else None
 
 
-def _inside(mark: Mark, points: np.ndarray) -> np.ndarray:
-    """(...) whether ground points (..., 2) lie inside a convex mark."""
+def _cover(mark: Mark, points: np.ndarray, foot: np.ndarray) -> np.ndarray:
+    """(...) how much of a convex mark's colour ground points (..., 2) show.
+
+    ``foot`` (2, 2) maps a direction on the ground to the size of a pixel along it (m): a mark
+    thinner than a pixel is drawn a pixel wide and paler, so that no line gets lost.
+    """
     corners = np.asarray(mark.corners)
     edges = np.roll(corners, -1, axis=0) - corners
-    rel = points[..., None, :] - corners
-    cross = edges[:, 0] * rel[..., 1] - edges[:, 1] * rel[..., 0]
-    return np.logical_or((cross >= 0).all(-1), (cross <= 0).all(-1))
+    length = np.linalg.norm(edges, axis=1).clip(1e-9)
+    normal = np.stack((-edges[:, 1], edges[:, 0]), axis=1) / length[:, None]
+    depth = (corners @ normal.T).T - (corners * normal).sum(1)[:, None]  # (edges, corners)
+    turn = 1.0 if depth.max() >= -depth.min() else -1.0
+    width = np.ptp(depth, axis=1)
+    pixel = np.linalg.norm(normal @ foot, axis=1)
+    slack = np.maximum(pixel - width, 0.0) / 2
+    inside = np.ones(points.shape[:-1], dtype=bool)
+    for n, start, s in zip(normal, corners, slack):
+        inside &= ((points - start) @ n) * turn >= -s
+    return inside * max(float((width / np.maximum(width, pixel)).min()), 0.35)
 
 
-def _lines(x: np.ndarray, width: float) -> np.ndarray:
-    """1 on lines of the given width (m) at whole metres, else 0."""
-    return (np.abs(x - np.round(x)) < width / 2).astype(float)
+def _lines(x: np.ndarray, width: float, step: float) -> np.ndarray:
+    """1 on lines of the given width (m) at whole multiples of a step, else 0."""
+    return (np.abs(x - step * np.round(x / step)) < width / 2).astype(float)
 
 
-def _ground(view: View, marks: Sequence[Mark], hit: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(H, W, 3) colours of the ground: plain, one-metre grid, painted marks."""
+def _ground(
+    view: View,
+    marks: Sequence[Mark],
+    hit: np.ndarray,
+    points: np.ndarray,
+    rough: float,
+    step: float,
+    k: int,
+) -> np.ndarray:
+    """(H, W, 3) colours of the ground: plain, a grid of ``step`` (m), painted marks; ``rough``:
+    how far it may lie above or below z = 0 (m), ``k``: the view's pixels to one of the picture."""
     image = np.broadcast_to(GROUND, points.shape).copy()
+    right, up, into = view.axes
     line = 1.2 / view.scale
-    grid = np.maximum(_lines(points[..., 0], line), _lines(points[..., 1], line))
+    grid = np.maximum(*(_lines(points[..., i], line, step) for i in (0, 1)))
     image -= 0.07 * grid[..., None]
+    foot = np.stack((right[:2], up[:2] / max(into[2] ** 2, 1e-6)), axis=1) * k / view.scale
     for mark in marks:
         corners = np.asarray(mark.corners)
         near = np.c_[corners, np.zeros(len(corners))]
-        box = _box(view, near, 0.0)
+        box = _box(view, near, rough)
         if box is None:
             continue
-        inside = _inside(mark, points[box][..., :2]) & hit[box]
-        patch = image[box]
+        cover = (_cover(mark, points[box][..., :2], foot) * hit[box])[..., None]
         # The grid stays faintly visible through the paint.
         tone = np.array(rgb(mark.color)) - 0.04 * grid[box][..., None]
-        patch[inside] = tone[inside]
+        image[box] += cover * (tone - image[box])
     return image
+
+
+def _waves(view: View, ground: Terrain, back: np.ndarray) -> np.ndarray:
+    """(H, W) distance of the first wave in the way of each ray from ``back``; inf for none."""
+    into, high = view.axes[2], ground.highest
+    slope = max(-into[2], 1e-9)
+    first = (back[..., 2] - high) / slope
+    span = 2 * high / slope
+    steps = max(2, math.ceil(span * math.hypot(into[0], into[1]) / STRIDE))
+
+    def over(t: np.ndarray) -> np.ndarray:
+        p = back + t[..., None] * into
+        return p[..., 2] - ground.height(p[..., 0], p[..., 1])
+
+    low, up = first, over(first)
+    found = np.full(first.shape, False)
+    a, b, ya, yb = (np.zeros_like(first) for _ in range(4))
+    for i in range(1, steps + 1):
+        t = first + span * i / steps
+        y = over(t)
+        new = (y <= 0) & ~found
+        a, b = np.where(new, low, a), np.where(new, t, b)
+        ya, yb = np.where(new, up, ya), np.where(new, y, yb)
+        found |= new
+        low, up = t, y
+    for _ in range(3):  # regula falsi: a metre's wave is nearly straight over a stride
+        t = a + (b - a) * ya / np.where(ya - yb == 0, 1.0, ya - yb)
+        y = over(t)
+        a, ya = np.where(y > 0, t, a), np.where(y > 0, y, ya)
+        b, yb = np.where(y > 0, b, t), np.where(y > 0, yb, y)
+    return np.where(found, t, np.inf)
+
+
+def _strings(solid: Solid, points: np.ndarray, pixel: float) -> np.ndarray:
+    """(...) opacity of a net at world points on it: its strings, ``pixel`` (m) or more wide."""
+    p = (points - solid.pos) @ solid.rot
+    across = np.argsort(solid.size)[-2:]
+    width = max(0.012, min(pixel, 0.4 * solid.mesh))
+    string = np.zeros(points.shape[:-1])
+    for axis in across:
+        string = np.maximum(string, _lines(p[..., axis] + solid.size[axis], width, solid.mesh))
+    return np.maximum(solid.alpha * 0.35, string * 0.85)
 
 
 def draw(
@@ -205,6 +284,7 @@ def draw(
     view: View,
     marks: Sequence[Mark] = (),
     *,
+    ground: Terrain | None = None,
     supersample: int = 2,
     ruler: bool = True,
 ) -> np.ndarray:
@@ -214,23 +294,23 @@ def draw(
         solids: shapes in the world.
         view: the camera.
         marks: convex polygons painted on the ground, later ones on top.
+        ground: waves instead of the plane z = 0.
         supersample: samples per pixel and axis.
-        ruler: draws lines of equal height, one metre apart, behind everything; they are true
-            in the vertical plane through ``view.target`` that faces the camera.
+        ruler: draws lines of equal height, as far apart as the grid's, behind everything; they
+            are true in the vertical plane through ``view.target`` that faces the camera.
 
     Returns:
         (height_px, width_px, 3) uint8 picture.
     """
     k = supersample
-    view = View(
-        view.target, view.azimuth, view.pitch, view.height, view.width_px * k, view.height_px * k
-    )
+    step = grid_step(view)
+    view = replace(view, width_px=view.width_px * k, height_px=view.height_px * k)
     right, _up, into = view.axes
     origins = view.origins(slice(None), slice(None))
     shape = origins.shape[:2]
     ramp = np.linspace(0, 1, shape[0])[:, None, None]
     image = np.broadcast_to(SKY_HIGH * (1 - ramp) + SKY_LOW * ramp, origins.shape).copy()
-    back = origins - 60.0 * into  # rays start well before the scene
+    back = origins - FAR * into
 
     if ruler:
         # Height above ground where the ray meets the upright plane through the target.
@@ -239,47 +319,77 @@ def draw(
         z = back[..., 2] + t * into[2]
         along = (back + t[..., None] * into) @ right
         line = 1.2 / view.scale
-        grid = np.maximum(_lines(z, line), _lines(along, line)) * (z > 0)
+        grid = np.maximum(_lines(z, line, step), _lines(along, line, step)) * (z > 0)
         image -= 0.08 * grid[..., None]
 
-    t_ground = back[..., 2] / max(-into[2], 1e-9)
-    points = back + t_ground[..., None] * into
-    # An orthographic ground has no horizon of its own: end it some metres behind the athlete.
+    t_ground = back[..., 2] / max(-into[2], 1e-9) if ground is None else _waves(view, ground, back)
+    points = back + np.where(np.isfinite(t_ground), t_ground, 0.0)[..., None] * into
     flat = np.array([into[0], into[1]]) / math.hypot(into[0], into[1])
-    hit = (points[..., :2] - view.target[:2]) @ flat < 6.0
-    ground = _ground(view, marks, hit, points)
-    shadow = np.zeros(shape, dtype=bool)
+    hit = ((points[..., :2] - view.target[:2]) @ flat < view.horizon) & np.isfinite(t_ground)
+    rough = 0.0 if ground is None else ground.highest
+    tone = _ground(view, marks, hit, points, rough, step, k)
+    if ground is not None:
+        n = ground.normal(points[..., 0], points[..., 1])
+        tone *= (0.45 + 0.55 * np.clip(n @ SUN, 0, 1) / SUN[2])[..., None]
+        tone *= 1.0 + 0.12 * points[..., 2:] / ground.highest  # crests are paler than hollows
+    tone *= (1.0 - 0.28 * _shadows(view, solids, points, rough))[..., None]
+    image[hit] = tone[hit]
+    depth = np.where(hit, t_ground, np.inf)
+
+    clear = [s for s in solids if s.alpha < 1.0 or s.mesh > 0.0]
+    for solid in solids:
+        if solid.alpha >= 1.0 and solid.mesh == 0.0:
+            _paint(view, solid, image, depth, back, k)
+    for solid in sorted(clear, key=lambda s: -float((s.pos - view.target) @ into)):
+        _paint(view, solid, image, depth, back, k)
+    image = image.reshape(shape[0] // k, k, shape[1] // k, k, 3).mean((1, 3))
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def _shadows(view: View, solids: Sequence[Solid], points: np.ndarray, rough: float) -> np.ndarray:
+    """(H, W) how much of the sun solids keep from ground points (H, W, 3), 0..1."""
+    shadow = np.zeros(points.shape[:2])
     for solid in solids:
         # A shadow lies on the ground between the body's foot point and its sun shift.
-        reach = solid.radius
         drop = solid.pos - SUN * (solid.pos[2] / SUN[2])
-        spread = reach / SUN[2] * 1.1
+        spread = (solid.radius / SUN[2] + rough / SUN[2]) * 1.1
         box = _box(view, drop, spread)
         if box is None or solid.pos[2] < -1.0:
             continue
         t, _ = intersect(solid, points[box], SUN)
-        shadow[box] |= np.isfinite(t) & (t > 0)
-    ground *= np.where(shadow, 0.72, 1.0)[..., None]
-    image[hit] = ground[hit]
-    depth = np.where(hit, t_ground, np.inf)
+        dark = 0.35 if solid.mesh else solid.alpha
+        shadow[box] = np.maximum(shadow[box], dark * (np.isfinite(t) & (t > 0)))
+    return shadow
 
+
+def _paint(
+    view: View, solid: Solid, image: np.ndarray, depth: np.ndarray, back: np.ndarray, k: int
+) -> None:
+    """Draws one solid over a picture (H, W, 3) where it is nearer than ``depth`` (H, W)."""
+    box = _box(view, solid.pos, solid.radius)
+    if box is None:
+        return
+    into = view.axes[2]
+    t, normal = intersect(solid, back[box], into)
+    front = t < depth[box]
+    if not front.any():
+        return
     half = SUN - into
     half /= np.linalg.norm(half)
-    for solid in solids:
-        box = _box(view, solid.pos, solid.radius)
-        if box is None:
-            continue
-        t, normal = intersect(solid, back[box], into)
-        front = t < depth[box]
-        if not front.any():
-            continue
-        n = normal[front]
-        lit = np.clip(n @ SUN, 0, 1)
-        sky = 0.5 + 0.5 * n[:, 2]
-        rim = np.clip(1 + n @ into, 0, 1) ** 3
-        shade = 0.52 + 0.20 * sky + 0.40 * lit - 0.30 * rim
-        gloss = 0.10 * np.clip(n @ half, 0, 1) ** 24
-        image[box][front] = np.asarray(solid.color) * shade[:, None] + gloss[:, None]
+    n = normal[front]
+    lit = np.clip(n @ SUN, 0, 1)
+    sky = 0.5 + 0.5 * n[:, 2]
+    rim = np.clip(1 + n @ into, 0, 1) ** 3
+    shade = 0.52 + 0.20 * sky + 0.40 * lit - 0.30 * rim
+    gloss = 0.10 * np.clip(n @ half, 0, 1) ** 24
+    color = np.asarray(solid.color) * shade[:, None] + gloss[:, None]
+    if solid.alpha >= 1.0 and solid.mesh == 0.0:
+        image[box][front] = color
         depth[box][front] = t[front]
-    image = image.reshape(shape[0] // k, k, shape[1] // k, k, 3).mean((1, 3))
-    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+        return
+    alpha = np.full(len(color), solid.alpha)
+    if solid.mesh:
+        points = back[box][front] + t[front][:, None] * into
+        alpha = _strings(solid, points, k / view.scale)
+    under = image[box][front]
+    image[box][front] = under + alpha[:, None] * (color - under)

@@ -8,18 +8,18 @@ import os
 import subprocess
 import sys
 from collections.abc import Generator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Literal
 
 import mujoco
 import numpy as np
 
+from olympics_opt.camera import focus, smooth, stand, tracking
+from olympics_opt.decor import decorated
 from olympics_opt.episode import Episode, Player, heading
-from olympics_opt.raycast import SUN, View, draw
-from olympics_opt.scenery import ground_marks, link_color, rgb
-from sports.humanoid.mjcf import body_name, build_spec
-from sports.scene import Scene
+from olympics_opt.raycast import SUN, draw
+from olympics_opt.scenery import ground_marks, terrain
 
 Pictures = Generator[np.ndarray, None, None]
 """(height, width, 3) uint8 frames."""
@@ -70,96 +70,34 @@ def _probe_gl(name: str) -> None:
         raise RuntimeError(lines[-1].strip())
 
 
-def _decorated(scene: Scene) -> mujoco.MjModel:
-    """The scene's model with light, sky, a grid on the ground, marks and limb colours."""
-    spec = build_spec(scene)
-    spec.visual.headlight.ambient[:] = (0.38, 0.38, 0.38)
-    spec.visual.headlight.diffuse[:] = (0.30, 0.30, 0.30)
-    spec.visual.headlight.specular[:] = (0.1, 0.1, 0.1)
-    spec.visual.quality.shadowsize = 4096
-    # Shadows are sharp within this many metres (see the light's place in `_gl_frames`).
-    spec.stat.extent = 5.0
-    spec.visual.map.znear, spec.visual.map.zfar = 0.01, 40.0
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=rgb("#9dbfdd"),
-        rgb2=rgb("#eef3f7"),
-        width=256,
-        height=1536,
-    )
-    texture = spec.add_texture(
-        name="grid",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        mark=mujoco.mjtMark.mjMARK_EDGE,
-        rgb1=rgb("#d5dbdd"),
-        rgb2=rgb("#d5dbdd"),
-        markrgb=rgb("#98a5ab"),
-        width=128,
-        height=128,
-    )
-    assert texture is not None
-    material = spec.add_material(name="grid", texrepeat=(1.0, 1.0), texuniform=True)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
-    ground = spec.geom("ground")
-    ground.material = "grid"
-    ground.rgba = (1.0, 1.0, 1.0, 1.0)
-    light = spec.worldbody.add_light(
-        name="sun",
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        castshadow=True,
-        diffuse=(0.55, 0.55, 0.52),
-        specular=(0.2, 0.2, 0.2),
-    )
-    light.dir = -SUN
-    for i, mark in enumerate(ground_marks(scene)):
-        corners = np.asarray(mark.corners)
-        low, high = corners.min(0), corners.max(0)
-        thickness = 0.001 + 0.0002 * i  # paint over paint
-        spec.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=(*(low + high) / 2, 0.0),
-            size=(*(high - low) / 2, thickness),
-            contype=0,
-            conaffinity=0,
-            rgba=(*rgb(mark.color), 1.0),
-        )
-    for agent in range(scene.num_agents):
-        for name in scene.body.link_names:
-            for geom in spec.body(body_name(agent, name)).geoms:
-                geom.rgba = (*rgb(link_color(name)), 1.0)
-    return spec.compile()
-
-
-def _smooth(values: np.ndarray, sigma: float) -> np.ndarray:
-    """(T, k) values smoothed over time by a Gaussian of ``sigma`` frames."""
-    reach = math.ceil(3 * sigma)
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
-    return np.stack(
-        [np.convolve(column, kernel / kernel.sum(), mode="valid") for column in padded.T], axis=1
-    )
-
-
 def _gl_frames(episode: Episode, width: int, height: int) -> Pictures:
-    """Pictures of every frame by MuJoCo's renderer; the camera follows the athlete's side."""
-    player = Player(episode, _decorated(episode.scene))
+    """Pictures of every frame by MuJoCo's renderer; the camera follows what matters."""
+    ground = terrain(episode.scene, getattr(episode, "shown", {}))
+    player = Player(episode, partial(decorated, ground=ground))
     renderer = _gl_renderer(player.model, width, height)
     try:
-        root = _smooth(player.qpos[:, :3], 0.25 / episode.dt)
+        own = stand(player.scene)
+        lens = 1.0 / math.tan(math.radians(player.model.vis.global_.fovy) / 2)
         camera = mujoco.MjvCamera()
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        camera.distance, camera.elevation = 4.7, -9.0
-        camera.azimuth = math.degrees(heading(player.qpos)) + 62.0
+        if own is None:
+            root = smooth(player.qpos[:, :3], 0.25 / episode.dt)
+            looks = root * (1.0, 1.0, 0.75) + (0.35, 0.0, 0.15)
+            away = np.full(len(player), 4.7)
+            camera.azimuth, camera.elevation = math.degrees(heading(player.qpos)) + 62.0, -9.0
+        else:
+            looks, away = focus(player, lens, width / height)
+            camera.azimuth, camera.elevation = own.azimuth, -own.pitch
+            # The extent of the scene decides what is clipped and how far shadows reach.
+            player.model.stat.extent = max(5.0, float(away.max()))
+        sun = 0.8 * player.model.stat.extent
         for i in range(len(player)):
             player.show(i)
             mujoco.mj_comPos(player.model, player.data)
-            # The sun travels along, so that its shadow map covers the athlete's surroundings.
-            player.model.light_pos[0] = root[i] * (1.0, 1.0, 0.0) + 4.0 * SUN
+            # The sun travels along, so that its shadow map covers the athletes' surroundings.
+            player.model.light_pos[0] = looks[i] * (1.0, 1.0, 0.0) + sun * SUN
             mujoco.mj_camlight(player.model, player.data)
-            camera.lookat[:] = root[i] * (1.0, 1.0, 0.75) + (0.35, 0.0, 0.15)
+            camera.lookat[:], camera.distance = looks[i], max(4.7, away[i])
             renderer.update_scene(player.data, camera)
             yield renderer.render()
     finally:
@@ -170,13 +108,8 @@ def _software_frames(episode: Episode, width: int, height: int) -> Pictures:
     """Pictures of every frame by the software renderer."""
     player = Player(episode)
     marks = ground_marks(episode.scene)
-    root = _smooth(player.qpos[:, :3], 0.15 / episode.dt)
-    metres = 3.2
-    for i, p in enumerate(root):
-        target = np.array([p[0], p[1], max(metres / 2 - 0.3, p[2] + 0.9 - metres / 2)])
-        azimuth = heading(player.qpos) + math.pi / 2 - 0.3
-        view = View(target, azimuth, math.radians(9.0), metres, width, height)
-        yield draw(player.solids(i), view, marks)
+    for i, view in enumerate(tracking(player, width, height)):
+        yield draw(player.solids(i), view, marks, ground=player.ground)
 
 
 def render_video(

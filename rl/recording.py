@@ -55,6 +55,8 @@ class Recording:
     strength: str = "paper"
     limits: str = "paper"
     timestep_divisor: int = 1
+    shown: dict[str, np.ndarray] = field(default_factory=dict)
+    """(T, ...) what pictures need to know of the field in this world, by name (``Task.shown``)."""
     meta: dict[str, Any] = field(default_factory=dict)
     """Plain JSON: commit, policy sha256, ..."""
 
@@ -75,11 +77,13 @@ class Recording:
         names = ("task", "options", "metrics", "seed", "world", "dt", "engine", "strength")
         meta = {name: getattr(self, name) for name in names}
         meta |= {"format": FORMAT, "limits": self.limits, "meta": self.meta}
-        meta |= {"timestep_divisor": self.timestep_divisor, "terms": list(self.terms)}
+        meta |= {"timestep_divisor": self.timestep_divisor}
+        meta |= {"terms": list(self.terms), "shown": list(self.shown)}
         arrays = {name: np.asarray(getattr(self, name), np.float32) for name in _ARRAYS}
-        arrays |= {
-            f"term_{i}": np.asarray(x, np.float32) for i, x in enumerate(self.terms.values())
-        }
+        for prefix, tables in (("term", self.terms), ("shown", self.shown)):
+            arrays |= {
+                f"{prefix}_{i}": np.asarray(x, np.float32) for i, x in enumerate(tables.values())
+            }
         data = io.BytesIO()
         np.savez_compressed(data, meta=np.array(json.dumps(meta)), **arrays)  # type: ignore[arg-type]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -94,10 +98,14 @@ class Recording:
                 if not isinstance(meta, dict) or meta.pop("format", None) != FORMAT:
                     raise ValueError("it has another format")
                 terms = {n: data[f"term_{i}"] for i, n in enumerate(meta.pop("terms"))}
+                # Recordings of earlier versions show nothing.
+                names = enumerate(meta.pop("shown", ()))
+                shown = {n: data[f"shown_{i}"] for i, n in names}
                 arrays = {name: data[name] for name in _ARRAYS}
-            if len({len(x) for x in (*arrays.values(), *terms.values())}) != 1:
+            tables = (*arrays.values(), *terms.values(), *shown.values())
+            if len({len(x) for x in tables}) != 1:
                 raise ValueError("its arrays differ in length")
-            return Recording(**meta, **arrays, terms=terms)
+            return Recording(**meta, **arrays, terms=terms, shown=shown)
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"'{path}' is not a recording of this project: {error}") from error
 
@@ -140,8 +148,10 @@ class Tape:
         rows: dict[str, Any]
         rows = {n: np.stack([s[n][world] for s in self.steps[start:end]]) for n in self.steps[0]}
         terms = {n[6:]: rows.pop(n) for n in list(rows) if n.startswith("terms/")}
+        shown = {n[6:]: rows.pop(n) for n in list(rows) if n.startswith("shown/")}
         return Recording(
             terms=terms,
+            shown=shown,
             metrics=metrics,
             world=int(world),
             dt=self.env.physics.scene.control_timestep,

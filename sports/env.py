@@ -28,6 +28,8 @@ no_autograd = getattr(torch._C, "_AutoDispatchBelowAutograd", contextlib.nullcon
 take a tenth less time on a CPU (a GPU does not wait for them); unlike those of
 ``torch.inference_mode`` the results are plain tensors."""
 
+_PHYSICS = tuple(f.name for f in dataclasses.fields(PhysicsState))
+
 
 @dataclass
 class StepResult:
@@ -264,9 +266,12 @@ class Env:
         return proprioception(view.physics, view.heading, tuple(goal.values())).nan_to_num_()
 
     def snapshot(self) -> dict[str, Tensor]:
-        """Copies of qpos, qvel, mocap_pos and ground_force, for recordings."""
+        """Copies of qpos, qvel, mocap_pos and ground_force, for recordings, and of what the task
+        shows (``shown/NAME``)."""
         physics = self.physics
+        shown = {k: self.memory[k].clone() for k in self.task.shown if k in self.memory}
         return {
+            **{f"shown/{name}": value for name, value in shown.items()},
             "qpos": physics.qpos.clone(),
             "qvel": physics.qvel.clone(),
             "mocap_pos": physics.mocap_pos.clone(),
@@ -283,6 +288,8 @@ class Env:
             "age": self.age.clone(),
             "generator": self.generator.get_state(),
         }
+        if self.physics.scene.has_waves:
+            state["wave_phase"] = self.physics.wave_phase.clone()
         extra = getattr(self.physics, "extra_state", None)
         if extra is not None:
             state |= {f"physics/{k}": v for k, v in extra().items()}
@@ -301,7 +308,7 @@ class Env:
             raise ValueError("the environment state is of another task or number of worlds")
         moved = {k: v if k == "generator" else v.to(self.device) for k, v in state.items()}
         everyone = torch.ones(self.num_worlds, dtype=torch.bool, device=self.device)
-        physics_state = PhysicsState(moved["qpos"], moved["qvel"], moved["mocap_pos"])
+        physics_state = PhysicsState(**{k: moved[k] for k in _PHYSICS if k in moved})
         self.physics.reset(everyone, physics_state)
         load_extra = getattr(self.physics, "load_extra_state", None)
         if load_extra is not None:
@@ -324,7 +331,7 @@ class Env:
         def part(prefix: str) -> Memory:
             return {k[len(prefix) :]: v.clone() for k, v in state.items() if k.startswith(prefix)}
 
-        start = PhysicsState(*(state[k].clone() for k in ("qpos", "qvel", "mocap_pos")))
+        start = PhysicsState(**{k: state[k].clone() for k in _PHYSICS if k in state})
         self.view.curriculum = part("curriculum/")
         self._stock = self._prepare(start, part("context/"))
         self._stock.used = state["used"].clone()

@@ -7,32 +7,42 @@ from typing import Any
 
 from sports import (
     basketball,
+    boxing,
+    fencing,
     free_throw,
+    golf,
     high_jump,
     hurdling,
     javelin,
     long_jump,
     penalty_kick,
     soccer,
+    table_tennis,
+    tennis,
 )
 from sports.humanoid.body import load_body
 from sports.task import Task
 
-_TASKS: dict[str, Task] = {
-    t.name: t
-    for t in (
-        high_jump.TASK,
-        long_jump.TASK,
-        hurdling.TASK,
-        javelin.TASK,
-        penalty_kick.TASK,
-        soccer.SOCCER_1V1,
-        soccer.SOCCER_2V2,
-        free_throw.TASK,
-        basketball.BASKETBALL_1V1,
-        basketball.BASKETBALL_2V2,
-    )
-}
+_ALL = (
+    high_jump.TASK,
+    long_jump.TASK,
+    hurdling.TASK,
+    javelin.TASK,
+    golf.TASK,
+    tennis.TASK,
+    tennis.DUEL,
+    table_tennis.TASK,
+    table_tennis.DUEL,
+    fencing.TASK,
+    boxing.TASK,
+    penalty_kick.TASK,
+    soccer.SOCCER_1V1,
+    soccer.SOCCER_2V2,
+    free_throw.TASK,
+    basketball.BASKETBALL_1V1,
+    basketball.BASKETBALL_2V2,
+)
+_TASKS: dict[str, Task] = {task.name: task for task in _ALL}
 
 
 def task_names() -> tuple[str, ...]:

@@ -38,12 +38,14 @@ class SceneObject:
     """A ball, a bar, an upright, a net: shapes rigidly joined, and how they move.
 
     ``free`` objects have a free joint and are simulated; ``fixed`` ones never move; ``mocap``
-    ones are fixtures whose position is state, set per world at a reset (uprights, hurdles).
+    ones are fixtures whose position is state, set per world at a reset (uprights, hurdles). A
+    ``ball`` has a place in the state as a free object has, but the ball law (``sports/ball.py``)
+    moves it: it meets the scene's surfaces and nothing else.
     """
 
     name: str
     shapes: tuple[Shape, ...]
-    motion: Literal["free", "fixed", "mocap"]
+    motion: Literal["free", "fixed", "mocap", "ball"]
     pos: tuple[float, float, float]
     """Start position of the object's frame in the world (m)."""
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
@@ -53,6 +55,15 @@ class SceneObject:
     """Whether the object collides with the ground plane."""
     solref: tuple[float, float] | None = None
     """MuJoCo contact reference (time constant s, damping ratio); None for the default."""
+    law: str | None = None
+    """Which ball of ``sports.ball.BALLS`` a ``ball`` is: tennis, table_tennis, golf."""
+    drag: tuple[float, float] | None = None
+    """Quadratic drag of a free object through the air (N s^2/m^2): along its x axis and across
+    it. The force on its centre of mass is ``-k |v| v`` of either part of its velocity."""
+    holdable: bool = False
+    """Whether hands can hold it: its contacts with athletes are then firm (``mjcf.HOLD_SOLREF``),
+    whatever ``solref`` says; in MuJoCo's usual ones friction creeps by centimetres a second."""
+
     restitution: float | None = None
     """Of a ball (a free object of one sphere): share of the normal speed that it keeps when it hits
     anything, which it alone decides; None for the engine's own contact. Its ``friction`` is then
@@ -61,12 +72,12 @@ class SceneObject:
     """Friction of such a ball with athletes. With other objects it has none."""
     rolling: float = 0.0
     """Rate at which such a ball loses speed as it rolls (1/s): from v it rolls v / rate far."""
-    holdable: bool = False
-    """Whether hands can hold it: its contacts with athletes are then firm (``mjcf.HOLD_SOLREF``),
-    whatever ``solref`` and ``restitution`` say; in MuJoCo's usual ones friction creeps by
-    centimetres a second."""
 
     def __post_init__(self) -> None:
+        if (self.motion == "ball") != (self.law is not None):
+            raise ValueError(f"object '{self.name}': a ball, and only a ball, follows a ball law")
+        if self.drag is not None and self.motion != "free":
+            raise ValueError(f"object '{self.name}' is not free, so it has no drag")
         if self.restitution is None:
             if self.grip or self.rolling:
                 raise ValueError(f"object '{self.name}': grip and rolling need a restitution")
@@ -90,11 +101,50 @@ class SceneObject:
 
 
 @dataclass(frozen=True)
+class Surface:
+    """Something that a ball of the ball law can hit, in the world or on an athlete's link.
+
+    ``kind`` and ``size`` (m), in the surface's frame:
+      * ``plane``: z = 0, solid below; no size
+      * ``box``: half-extents (3)
+      * ``disc``: across z, both faces: radius and half its thickness
+      * ``waves``: z = amplitude (cos(k x + a) + cos(k y + b)) smoothstep(inner, outer) over the
+        distance from the z axis; amplitude, k (rad/m), inner, outer. The phases a and b of each
+        world are ``Physics.wave_phase``
+    """
+
+    name: str
+    kind: Literal["plane", "box", "disc", "waves"]
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Origin of its frame in the world, or in the frame of its link (m)."""
+    size: tuple[float, ...] = ()
+    link: str | None = None
+    """``"agent0/R_Wrist"``: a tool, which moves with that link and feels the impacts; None for a
+    surface at rest."""
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Attitude of its frame."""
+    restitution: float | None = None
+    """None for that of the ball: on tools if the surface is on a link, else on the ground."""
+    friction: float | None = None
+    """None for that of the ball."""
+
+    def __post_init__(self) -> None:
+        wanted = {"plane": 0, "box": 3, "disc": 2, "waves": 4}
+        if self.kind not in wanted:
+            raise ValueError(f"surface '{self.name}': unknown kind '{self.kind}'")
+        if len(self.size) != wanted[self.kind] or any(x <= 0 for x in self.size):
+            raise ValueError(f"surface '{self.name}': a {self.kind} cannot have size {self.size}")
+        if self.kind == "waves" and (self.link is not None or self.quat != (1.0, 0.0, 0.0, 0.0)):
+            raise ValueError(f"surface '{self.name}': waves lie flat in the world")
+
+
+@dataclass(frozen=True)
 class Scene:
     """One world: athletes (agents), objects, time step and the contacts that a task names.
 
     State layout on every engine: ``qpos`` = for each agent 7 + num_dofs, then 7 for each free
-    object in order; ``qvel`` = for each agent 6 + num_dofs, then 6 for each free object.
+    object in order; ``qvel`` = for each agent 6 + num_dofs, then 6 for each free object. A ball
+    of the ball law counts as a free object here. Raises ValueError for two of those.
     """
 
     name: str
@@ -108,6 +158,8 @@ class Scene:
     ``"ground"``."""
     link_contacts: bool = False
     """Whether ``Physics.link_force`` is wanted."""
+    surfaces: tuple[Surface, ...] = ()
+    """What a ball of the ball law can hit; ``Physics.ball_hits`` counts in this order."""
     timestep: float = 1.0 / 120.0
     substeps: int = 4
     ground_friction: float = 1.0
@@ -123,6 +175,12 @@ class Scene:
     sites: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """Named marks drawn by the renderer (goal, line), world frame (m)."""
 
+    def __post_init__(self) -> None:
+        if sum(o.motion == "ball" for o in self.objects) > 1:
+            raise ValueError(f"scene '{self.name}' has more than one ball of the ball law")
+        if len({s.name for s in self.surfaces}) != len(self.surfaces):
+            raise ValueError(f"scene '{self.name}' has two surfaces of one name")
+
     @property
     def control_timestep(self) -> float:
         """Seconds per control step."""
@@ -134,7 +192,25 @@ class Scene:
 
     @property
     def free_objects(self) -> tuple[SceneObject, ...]:
-        return tuple(o for o in self.objects if o.motion == "free")
+        """Objects with a place in the state, the ball of the ball law among them."""
+        return tuple(o for o in self.objects if o.motion in ("free", "ball"))
+
+    @property
+    def ball(self) -> SceneObject | None:
+        """The ball of the ball law, if there is one."""
+        return next((o for o in self.objects if o.motion == "ball"), None)
+
+    @property
+    def has_waves(self) -> bool:
+        """Whether a surface has phases of each world."""
+        return any(s.kind == "waves" for s in self.surfaces)
+
+    def surface_index(self, name: str) -> int:
+        """Column of a surface in ``Physics.ball_hits``. Raises KeyError."""
+        names = [s.name for s in self.surfaces]
+        if name not in names:
+            raise KeyError(f"scene '{self.name}' has no surface '{name}'")
+        return names.index(name)
 
     @property
     def bouncing(self) -> tuple[SceneObject, ...]:

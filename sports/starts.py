@@ -88,6 +88,7 @@ class Stock:
 
     def state_dict(self) -> dict[str, Tensor]:
         """What it can be worked out from again."""
-        state = {k: v.clone() for k, v in vars(self.state).items()} | {"used": self.used.clone()}
+        state = {k: v for k, v in vars(self.state.clone()).items() if v is not None}
+        state["used"] = self.used.clone()
         state |= {f"context/{k}": v.clone() for k, v in self.context.items()}
         return state | {f"curriculum/{k}": v.clone() for k, v in self.curriculum.items()}

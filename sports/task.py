@@ -169,6 +169,9 @@ class Task:
     """(view, memory, advance, ended (N,)) -> new curriculum state."""
     age_at_start: bool = True
     """Whether training starts episodes' truncation clocks at random ages."""
+    shown: tuple[str, ...] = ("target", "phases")
+    """What recordings keep of a world's memory for pictures, where there is such a thing: where
+    the target is, (N, 3) or (N, A, 3) m, and how golf's waves lie, (N, 2) rad."""
     summary: str = ""
     notes: Mapping[str, str] = field(default_factory=dict)
 

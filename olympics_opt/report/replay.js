@@ -16,8 +16,10 @@ const Replay = (() => {
       this.qpos = S.unpack(data.qpos);
       this.mocap = data.mocap ? S.unpack(data.mocap) : null;
       this.force = data.force ? S.unpack(data.force) : null;
+      this.distance = data.distance || 0; // from which the camera sees everybody
       this.end = this.start + this.dt * (this.qpos.length - 1);
-      // Where the camera looks: the root, averaged over half a second.
+      // Where the camera looks: what the page says, or the root, averaged over half a second.
+      this.aim = data.focus ? S.unpack(data.focus) : null;
       const reach = Math.max(1, Math.round(0.25 / this.dt)), last = this.qpos.length - 1;
       this.path = this.qpos.map((_, i) => {
         let sum = [0, 0, 0];
@@ -30,6 +32,7 @@ const Replay = (() => {
       return S.at(this.qpos, this.dt, t - this.start);
     }
     focus(t) {
+      if (this.aim) return Array.from(S.at(this.aim, this.dt, t - this.start));
       const p = S.at(this.path, this.dt, t - this.start);
       return [p[0], p[1], 0.8 * p[2] + 0.12];
     }
@@ -45,8 +48,9 @@ const Replay = (() => {
     }
     speed(t) {
       const i = Math.min(Math.max((t - this.start) / this.dt, 0.5), this.qpos.length - 1.5);
-      const a = S.at(this.qpos, this.dt, (i - 0.5) * this.dt);
-      return S.norm(S.sub(S.at(this.qpos, this.dt, (i + 0.5) * this.dt), a)) / this.dt;
+      const k = this.scene.subject.at;
+      const at = (j) => S.at(this.qpos, this.dt, j * this.dt).slice(k, k + 3);
+      return S.norm(S.sub(at(i + 0.5), at(i - 0.5))) / this.dt;
     }
     // Parts to draw, each with its colour; and the athletes' link poses.
     solids(t, own, lead) {  // lead: the first track shown, or null if this is it
@@ -56,8 +60,8 @@ const Replay = (() => {
         const links = S.linkPoses(scene.links, qpos, a * width);
         poses.push(...links);
         links.forEach((pose, i) => {
-          const color = tint || parse(scene.links[i].color);
-          for (const part of scene.links[i].parts) out.push([S.place(part, pose), color]);
+          for (const part of scene.links[i].parts)
+            out.push([S.place(part, pose), tint || parse(scene.colors[a][i][part.shape])]);
         });
       }
       const mocap = this.mocap ? S.at(this.mocap, this.dt, t - this.start) : [];
@@ -77,11 +81,16 @@ const Replay = (() => {
     const $ = (name) => root.querySelector(`[data-replay="${name}"]`);
     const canvas = $("canvas"), ctx = canvas.getContext("2d");
     const scene = data.scene;
-    for (const thing of [...scene.links, ...scene.objects]) thing.parts = thing.shapes.flatMap(S.parts);
+    for (const thing of [...scene.links, ...scene.objects]) {
+      const { alpha, net, over } = thing;
+      thing.parts = thing.shapes.flatMap((shape, k) =>
+        S.parts(shape).map((part) => ({ ...part, shape: k, alpha, net, over })));
+    }
     const tracks = data.tracks.map((track) => new Track(scene, track));
     const t0 = Math.min(...tracks.map((k) => k.start)), t1 = Math.max(...tracks.map((k) => k.end));
+    const far = Math.max(5.4, ...tracks.map((k) => k.distance));
     const home = () => ({
-      yaw: data.yaw, pitch: 0.16, distance: 5.4, follow: true, pan: [0, 0, 0], fixed: [0, 0, 0],
+      yaw: data.yaw, pitch: data.pitch, distance: far, follow: true, pan: [0, 0, 0], fixed: [0, 0, 0],
     });
     const state = { scene, view: home(), trails: true, forces: false, split: false };
     let t = Math.min(Math.max(data.poster, t0), t1), playing = false, speed = 1, queued = false;
@@ -122,10 +131,11 @@ const Replay = (() => {
         }
         ctx.restore();
       });
-      const lead = shown[0] || tracks[0], q = lead.state(t);
+      const lead = shown[0] || tracks[0], k = scene.subject.at, q = lead.state(t).slice(k, k + 3);
+      const name = scene.subject.name && `${scene.subject.name}   `;
       $("time").textContent = `${t.toFixed(2)} s`;
       $("facts").textContent =
-        `x ${q[0].toFixed(2)} m   height ${q[2].toFixed(2)} m   speed ${lead.speed(t).toFixed(1)} m/s`;
+        `${name}x ${q[0].toFixed(2)} m   height ${q[2].toFixed(2)} m   speed ${lead.speed(t).toFixed(1)} m/s`;
       $("scrub").value = String(t);
       $("scrub").setAttribute("aria-valuetext", `${t.toFixed(2)} seconds`);
     }
@@ -162,7 +172,7 @@ const Replay = (() => {
       request();
     }
     function zoom(factor) {
-      state.view.distance = Math.min(Math.max(state.view.distance * factor, 1.5), 40);
+      state.view.distance = Math.min(Math.max(state.view.distance * factor, 1.5), 120);
       request();
     }
     function orbit(dx, dy) {
@@ -176,7 +186,7 @@ const Replay = (() => {
       request();
     }
     function look(name) {
-      const view = { start: [data.yaw, 0.16], side: [data.heading + Math.PI / 2, 0.06],
+      const view = { start: [data.yaw, data.pitch], side: [data.heading + Math.PI / 2, 0.06],
         front: [data.heading + Math.PI, 0.1], behind: [data.heading, 0.22], top: [data.heading + Math.PI / 2, 1.5] }[name];
       if (!view) return;
       [state.view.yaw, state.view.pitch] = view;

@@ -10,16 +10,28 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 from html import escape
 from importlib import resources
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from olympics_opt.scenery import complete_qpos, ground_marks, link_color
+from olympics_opt.camera import focus, stand, things
+from olympics_opt.episode import Player
+from olympics_opt.scenery import (
+    Terrain,
+    complete_qpos,
+    dressed,
+    ground_marks,
+    is_net,
+    shape_colors,
+    terrain,
+)
+from olympics_opt.scenery.golf import FAIRWAY
 from sports.humanoid.body import Shape
 from sports.scene import Scene, SceneObject
 
@@ -27,6 +39,10 @@ MAX_RATE = 60.0
 """Frames per second kept; faster recordings are resampled."""
 COLORS = ("#5b6673", "#c2408f", "#1c8a5a", "#8a63d2", "#b58900", "#0f8b8d")
 """Colours of the tracks; the first track's athlete is drawn in its limb colours."""
+TURF_STEP = 0.8
+"""Distance of the points of a drawn terrain (m)."""
+LENS, ASPECT = 2.1, 1.9
+"""Of the page's camera (``replay_draw.js``) and its canvas."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +61,8 @@ class ReplayTrack:
     """(T, A, B, 3) force of the ground on each link (N), drawn as arrows on request."""
     start: float = 0.0
     """Time of the first frame on the common clock (s)."""
+    shown: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """What the recording says of the field (``Task.shown``)."""
 
     def __post_init__(self) -> None:
         qpos = np.atleast_2d(np.asarray(self.qpos, dtype=float))
@@ -63,6 +81,7 @@ class ReplayTrack:
             episode.dt,
             mocap_pos=episode.mocap_pos,
             ground_force=episode.ground_force,
+            shown=getattr(episode, "shown", {}),
         )
 
     @classmethod
@@ -147,19 +166,33 @@ def _track(scene: Scene, track: ReplayTrack, color: str) -> dict[str, Any]:
         "dt": dt,
         "qpos": pack(qpos),
     }
-    fixtures = len(scene.mocap_objects)
-    if fixtures:
-        mocap = track.mocap_pos
-        if mocap is None or np.size(mocap) == 0:
-            mocap = np.broadcast_to(scene.default_mocap_pos(), (len(qpos), fixtures, 3))
-        else:
-            mocap, _ = _resampled(np.asarray(mocap, dtype=float), track.dt)
-        packed["mocap"] = pack(np.reshape(mocap, (len(mocap), 3 * fixtures)))
+    player = Player(_episode(scene, track))
+    if player.mocap.shape[1]:
+        mocap, _ = _resampled(player.mocap, track.dt)
+        packed["mocap"] = pack(np.reshape(mocap, (len(mocap), -1)))
     if track.ground_force is not None and np.size(track.ground_force):
         force, _ = _resampled(np.asarray(track.ground_force, dtype=float), track.dt)
         force = np.where(np.linalg.norm(force, axis=-1, keepdims=True) > 20.0, force, 0.0)
         packed["force"] = pack(np.reshape(force, (len(force), -1)))
+    if stand(scene) is not None:
+        path, away = focus(player, LENS, ASPECT)
+        packed["focus"] = pack(_resampled(path, track.dt)[0])
+        packed["distance"] = round(float(away.max()), 2)
     return packed
+
+
+def _episode(scene: Scene, track: ReplayTrack) -> Any:
+    """A track as the camera and the player of pictures want it."""
+    mocap = np.zeros(0) if track.mocap_pos is None else track.mocap_pos
+    return SimpleNamespace(
+        task=scene.name,
+        scene=scene,
+        qpos=track.qpos,
+        mocap_pos=mocap,
+        ground_force=np.zeros(0),
+        dt=track.dt,
+        shown=track.shown,
+    )
 
 
 def _shape(shape: Shape) -> dict[str, Any]:
@@ -167,18 +200,31 @@ def _shape(shape: Shape) -> dict[str, Any]:
     return row if shape.end is None else {**row, "end": shape.end}
 
 
-def _object(o: SceneObject) -> dict[str, Any]:
+def _object(o: SceneObject, prop: bool) -> dict[str, Any]:
     channels = (round(255 * min(max(c, 0.0), 1.0)) for c in o.rgba[:3])
-    return {
+    row: dict[str, Any] = {
         "motion": o.motion,
         "pos": o.pos,
         "quat": o.quat,
         "color": "#" + "".join(f"{c:02x}" for c in channels),
         "shapes": [_shape(s) for s in o.shapes],
     }
+    if o.rgba[3] < 1.0:
+        row["alpha"] = round(float(o.rgba[3]), 3)
+    if is_net(o.name):
+        row["net"] = True
+    if prop:
+        row["over"] = 0.3  # paint on a thing: drawn after it
+    return row
 
 
-def _scene(scene: Scene) -> dict[str, Any]:
+def _scene(scene: Scene, shown: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    full, _ = dressed(scene, shown)
+    ground = terrain(scene, shown)
+    colors = [shape_colors(scene, agent) for agent in range(scene.num_agents)]
+    balls = [scene.object_qpos(name).start for name in things(scene)]
+    roots = [scene.agent_qpos(agent).start for agent in range(scene.num_agents)]
+    solo = stand(scene) is None
     return {
         "agents": scene.num_agents,
         "links": [
@@ -186,15 +232,43 @@ def _scene(scene: Scene) -> dict[str, Any]:
                 "name": link.name,
                 "parent": int(parent),
                 "offset": link.offset,
-                "color": link_color(link.name),
                 "shapes": [_shape(s) for s in link.shapes],
             }
             for link, parent in zip(scene.body.links, scene.body.parents())
         ],
-        "objects": [_object(o) for o in scene.objects],
-        "marks": [
-            {"corners": m.corners, "color": m.color, "label": m.label} for m in ground_marks(scene)
-        ],
+        "colors": [[own[link] for link in scene.body.link_names] for own in colors],
+        "objects": [_object(o, i >= len(scene.objects)) for i, o in enumerate(full.objects)],
+        "marks": _marks(scene, ground),
+        "terrain": None if ground is None else _turf(ground),
+        "trails": balls + (roots if solo or not balls else []),
+        "subject": {"at": balls[0] if balls else 0, "name": things(scene)[0] if balls else ""},
+    }
+
+
+def _marks(scene: Scene, ground: Terrain | None) -> list[dict[str, Any]]:
+    """Marks with their corners on the ground; the turf of a terrain is drawn by itself."""
+    found = []
+    for m in ground_marks(scene):
+        if ground is None:
+            corners: list[Any] = [[round(c, 4) for c in corner] for corner in m.corners]
+        elif m.color == FAIRWAY:
+            continue
+        else:
+            xy = np.array(m.corners)
+            z = ground.height(xy[:, 0], xy[:, 1])
+            corners = np.c_[xy, z + 0.01].round(4).tolist()
+        found.append({"corners": corners, "color": m.color, "label": m.label})
+    return found
+
+
+def _turf(ground: Terrain) -> dict[str, Any]:
+    """A terrain as rows of heights over a rectangle."""
+    mesh = ground.mesh(TURF_STEP)
+    return {
+        "low": mesh[0, 0, :2].tolist(),
+        "high": mesh[-1, -1, :2].tolist(),
+        "heights": mesh[..., 2].round(3).tolist(),
+        "color": FAIRWAY,
     }
 
 
@@ -218,16 +292,23 @@ def replay_data(
     if not tracks:
         raise ValueError("a replay needs at least one track")
     first = tracks[0]
+    scenery = _scene(scene, first.shown)
     if poster is None:
-        poster = first.start + float(first.qpos[:, 2].argmax()) * first.dt
+        height = complete_qpos(scene, first.qpos)[:, scenery["subject"]["at"] + 2]
+        poster = first.start + float(height.argmax()) * first.dt
     way = first.qpos[-1, :2] - first.qpos[0, :2]
     heading = math.atan2(way[1], way[0]) if np.hypot(*way) > 0.5 else 0.0
+    yaw, pitch, own = heading + math.radians(64), 0.16, stand(scene)
+    if own is not None:
+        yaw, pitch = math.radians(own.azimuth), math.radians(own.pitch)
+        heading = yaw - math.pi / 2  # the side view is the sport's own
     return {
-        "scene": _scene(scene),
+        "scene": scenery,
         "tracks": [_track(scene, t, COLORS[i % len(COLORS)]) for i, t in enumerate(tracks)],
         "poster": round(poster, 4),
         "heading": round(heading, 4),
-        "yaw": round(heading + math.radians(64), 4),
+        "yaw": round(yaw, 4),
+        "pitch": round(pitch, 4),
     }
 
 

@@ -100,7 +100,32 @@ const ReplayDraw = (() => {
     ctx.fill();
   }
 
+  // A piece of a net: a veil and its strings, across its two longer edges.
+  const MESH = 0.12;
+  function drawNet(ctx, cam, part, color) {
+    const corner = part.corners, at = corner[0];
+    const edges = [1, 2, 4].map((i) => S.sub(corner[i], at)).sort((a, b) => S.norm(b) - S.norm(a));
+    const [u, v, w] = edges, base = S.add(at, S.scale(w, 0.5)), alpha = ctx.globalAlpha;
+    const point = (a, b) => cam.project(S.add(base, S.add(S.scale(u, a), S.scale(v, b))));
+    ctx.fillStyle = ctx.strokeStyle = `rgb(${color.join(",")})`;
+    ctx.lineWidth = 0.8;
+    ctx.globalAlpha = 0.3 * alpha;
+    ctx.beginPath();
+    trace(ctx, [point(0, 0), point(1, 0), point(1, 1), point(0, 1)]);
+    ctx.fill();
+    ctx.globalAlpha = 0.8 * alpha;
+    ctx.beginPath();
+    for (const [n, line] of [
+      [Math.max(1, Math.round(S.norm(u) / MESH)), (k) => [point(k, 0), point(k, 1)]],
+      [Math.max(1, Math.round(S.norm(v) / MESH)), (k) => [point(0, k), point(1, k)]],
+    ])
+      for (let i = 0; i <= n; i++) trace(ctx, line(i / n));
+    ctx.stroke();
+    ctx.globalAlpha = alpha;
+  }
+
   function drawHull(ctx, cam, part, color) {
+    if (part.net) return drawNet(ctx, cam, part, color);
     const middle = S.scale(part.corners.reduce(S.add), 1 / part.corners.length);
     const screen = part.corners.map(cam.project);
     ctx.lineWidth = 0.7;
@@ -162,9 +187,41 @@ const ReplayDraw = (() => {
     return outline(cloud).map((p) => [p[0], p[1], 0]);
   }
 
-  function drawGround(ctx, cam, scene, target, theme) {
+  // Waves as quadrangles from far to near, paler on their crests.
+  function drawTerrain(ctx, cam, terrain) {
+    const { low, high, heights } = terrain, rows = heights.length, columns = heights[0].length;
+    const color = parse(terrain.color), flat = SUN[2];
+    const point = (r, c) => [
+      low[0] + ((high[0] - low[0]) * c) / (columns - 1),
+      low[1] + ((high[1] - low[1]) * r) / (rows - 1),
+      heights[r][c],
+    ];
+    const quads = [];
+    for (let r = 0; r + 1 < rows; r++)
+      for (let c = 0; c + 1 < columns; c++) {
+        const p = [point(r, c), point(r, c + 1), point(r + 1, c + 1), point(r + 1, c)];
+        quads.push([S.norm(S.sub(p[0], cam.eye)), p]);
+      }
+    quads.sort((a, b) => b[0] - a[0]);
+    ctx.lineWidth = 0.7;
+    for (const [, p] of quads) {
+      const shape = clipped(cam, p);
+      if (shape.length < 3) continue;
+      const n = S.unit(S.cross(S.sub(p[2], p[0]), S.sub(p[3], p[1])));
+      const k = (0.45 + (0.55 * Math.max(0, S.dot(n, SUN))) / flat) * (1 + 0.2 * p[0][2]);
+      ctx.fillStyle = ctx.strokeStyle = `rgb(${color.map((v) => Math.round(Math.min(255, v * k))).join(",")})`;
+      ctx.beginPath();
+      trace(ctx, shape);
+      ctx.closePath();
+      ctx.fill();
+      ctx.stroke();
+    }
+  }
+
+  function drawGround(ctx, cam, scene, target, theme, distance) {
+    if (scene.terrain) drawTerrain(ctx, cam, scene.terrain);
     for (const mark of scene.marks) {
-      const shape = clipped(cam, mark.corners.map((c) => [c[0], c[1], 0]));
+      const shape = clipped(cam, mark.corners.map((c) => [c[0], c[1], c[2] || 0]));
       if (shape.length < 3) continue;
       ctx.fillStyle = mark.color;
       ctx.globalAlpha = theme.paint;
@@ -173,16 +230,20 @@ const ReplayDraw = (() => {
       ctx.fill();
     }
     ctx.globalAlpha = 1;
-    // One-metre grid, in pieces of 2 m that fade with their distance; pieces of like strength
-    // are stroked together.
-    const x0 = Math.round(target[0]), y0 = Math.round(target[1]), reach = 14, levels = 6;
+    drawLabels(ctx, cam, scene, theme, distance);
+    if (scene.terrain) return;
+    // One-metre grid (five in wide pictures), in pieces of two that fade with their distance;
+    // pieces of like strength are stroked together.
+    const step = distance > 14 ? 5 : 1, reach = 14, levels = 6;
+    const x0 = step * Math.round(target[0] / step), y0 = step * Math.round(target[1] / step);
     const bins = Array.from({ length: levels }, () => []);
     for (let i = -reach; i <= reach; i++)
       for (let k = -reach; k < reach; k += 2) {
         const level = Math.floor((1 - Math.hypot(i, k + 1) / reach) * levels);
         if (level < 0) continue;
+        const a = step * i, b = step * k, c = step * (k + 2);
         bins[level].push(
-          [[x0 + i, y0 + k, 0], [x0 + i, y0 + k + 2, 0]], [[x0 + k, y0 + i, 0], [x0 + k + 2, y0 + i, 0]]);
+          [[x0 + a, y0 + b, 0], [x0 + a, y0 + c, 0]], [[x0 + b, y0 + a, 0], [x0 + c, y0 + a, 0]]);
       }
     ctx.strokeStyle = theme.grid;
     ctx.lineWidth = 1;
@@ -196,11 +257,10 @@ const ReplayDraw = (() => {
       ctx.stroke();
     });
     ctx.globalAlpha = 1;
-    drawLabels(ctx, cam, scene, theme);
   }
 
   // Names of the marks beside their edge nearest to the camera, as far as there is room.
-  function drawLabels(ctx, cam, scene, theme) {
+  function drawLabels(ctx, cam, scene, theme, distance) {
     ctx.font = "12px system-ui, sans-serif";
     ctx.textAlign = "center";
     ctx.fillStyle = theme.label;
@@ -210,7 +270,7 @@ const ReplayDraw = (() => {
       const xs = mark.corners.map((c) => c[0]), ys = mark.corners.map((c) => near * c[1]);
       const x = (Math.min(...xs) + Math.max(...xs)) / 2, y = near * (Math.min(...ys) - 0.2);
       const p = cam.project([x, y, 0]);
-      if (p[2] < 1 || p[2] > 25 || taken.some((q) => Math.hypot(p[0] - q[0], 2 * (p[1] - q[1])) < 44)) continue;
+      if (p[2] < 1 || p[2] > Math.max(25, 2 * distance) || taken.some((q) => Math.hypot(p[0] - q[0], 2 * (p[1] - q[1])) < 44)) continue;
       taken.push(p);
       ctx.fillText(mark.label, p[0], p[1] + 4);
     }
@@ -245,7 +305,7 @@ const ReplayDraw = (() => {
     sky.addColorStop(1, theme.ground);
     ctx.fillStyle = sky;
     ctx.fillRect(0, 0, width, height);
-    drawGround(ctx, cam, scene, target, theme);
+    drawGround(ctx, cam, scene, target, theme, view.distance);
 
     const items = [];
     ctx.fillStyle = theme.shadow;
@@ -256,7 +316,8 @@ const ReplayDraw = (() => {
       for (const [part, color] of solids.out) {
         const lowest = Math.min(...points(part).map((p) => cam.depth(p)));
         if (lowest < NEAR) continue;
-        items.push([S.norm(S.sub(center(part), cam.eye)), part, color]);
+        items.push([S.norm(S.sub(center(part), cam.eye)) - (part.over || 0), part, color]);
+        if (part.net) continue;
         const cast = clipped(cam, shadow(part));
         if (cast.length > 2) {
           trace(ctx, cast);
@@ -267,25 +328,33 @@ const ReplayDraw = (() => {
     ctx.fill("nonzero");
 
     if (state.trails)
-      for (const track of tracks) {
-        ctx.strokeStyle = track.color;
-        ctx.globalAlpha = 0.55;
-        ctx.lineWidth = 1.5;
-        ctx.setLineDash([2, 5]);
-        ctx.beginPath();
-        let pen = false;
-        for (const q of track.qpos) {
-          const p = cam.project(q);
-          if (p[2] > NEAR) pen ? ctx.lineTo(p[0], p[1]) : ctx.moveTo(p[0], p[1]);
-          pen = p[2] > NEAR;
+      for (const track of tracks)
+        for (const at of scene.trails) {
+          ctx.strokeStyle = at === scene.subject.at && scene.subject.name ? theme.force : track.color;
+          ctx.globalAlpha = 0.55;
+          ctx.lineWidth = 1.5;
+          ctx.setLineDash([2, 5]);
+          ctx.beginPath();
+          let pen = false, last = null;
+          for (const q of track.qpos) {
+            const place = [q[at], q[at + 1], q[at + 2]], p = cam.project(place);
+            // What was put elsewhere did not fly there.
+            if (last && S.norm(S.sub(place, last)) > 2) pen = false;
+            if (p[2] > NEAR) pen ? ctx.lineTo(p[0], p[1]) : ctx.moveTo(p[0], p[1]);
+            pen = p[2] > NEAR;
+            last = place;
+          }
+          ctx.stroke();
+          ctx.setLineDash([]);
+          ctx.globalAlpha = 1;
         }
-        ctx.stroke();
-        ctx.setLineDash([]);
-        ctx.globalAlpha = 1;
-      }
 
     items.sort((a, b) => b[0] - a[0]);
-    for (const [, part, color] of items) DRAW[part.kind](ctx, cam, part, color);
+    for (const [, part, color] of items) {
+      ctx.globalAlpha = part.net ? 1 : part.alpha || 1;
+      DRAW[part.kind](ctx, cam, part, color);
+    }
+    ctx.globalAlpha = 1;
 
     if (state.forces)
       for (const track of tracks)

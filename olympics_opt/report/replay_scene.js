@@ -113,15 +113,22 @@ const ReplayScene = (() => {
     };
   }
 
+  // A box in pieces no longer than PIECE along its two longest axes.
   function boxes(center, half) {
-    const axis = half.indexOf(Math.max(...half)), count = Math.ceil((2 * half[axis]) / PIECE);
-    const small = half.slice();
-    small[axis] = half[axis] / count;
-    return Array.from({ length: count }, (_, i) => {
-      const c = center.slice();
-      c[axis] += -half[axis] + (2 * i + 1) * small[axis];
-      return box(c, small);
-    });
+    const order = [0, 1, 2].sort((i, k) => half[k] - half[i]), small = half.slice();
+    const count = [1, 1, 1];
+    for (const axis of order.slice(0, 2)) {
+      count[axis] = Math.max(1, Math.ceil((2 * half[axis]) / PIECE));
+      small[axis] = half[axis] / count[axis];
+    }
+    const out = [];
+    for (let i = 0; i < count[0]; i++)
+      for (let j = 0; j < count[1]; j++)
+        for (let k = 0; k < count[2]; k++) {
+          const step = [i, j, k];
+          out.push(box(center.map((c, a) => c - half[a] + (2 * step[a] + 1) * small[a]), small));
+        }
+    return out;
   }
 
   function disc(a, b, r) {
@@ -163,11 +170,11 @@ const ReplayScene = (() => {
     return out;
   }
 
-  // Poses of the objects of a scene: free ones from qpos, mocap ones from their table.
+  // Poses of the objects of a scene: bodies and balls from qpos, mocap ones from their table.
   function objectPoses(scene, qpos, mocap) {
     let free = scene.agents * (7 + 3 * (scene.links.length - 1)), fixture = 0;
     return scene.objects.map((o) => {
-      if (o.motion === "free") {
+      if (o.motion === "free" || o.motion === "ball") {
         const q = free;
         free += 7;
         return {

@@ -50,10 +50,10 @@ damping, and so little yielding that a held javelin creeps by 0.2 mm/s."""
 BOUNCE_STIFFNESS, BOUNCE_IMPEDANCE = 144.0, 0.998
 """Of a ball's contacts: acceleration per depth (1/s^2) and impedance. It lies 0.1 mm deep; at
 1/120 s one that arrives at 30 m/s, up to 25 cm deep when it is seen, gains 1 % from the spring."""
-# Collision classes: objects, the ground plane, athletes, their fingers (which meet objects only).
-# What athletes meet in a way of their own (to hold it, to grip it) has every shape twice: one that
-# meets them, one that meets the rest.
-_SOLID, _GROUND, _ATHLETE, _FINGER, _REST = 1, 2, 4, 8, 16
+# Collision classes: all that is solid, the ground plane, athletes, other objects, fingers
+# (which meet objects only). What can be held has every shape twice: one for athletes, one for the
+# rest.
+_SOLID, _GROUND, _ATHLETE, _OBJECT, _FINGER = 1, 2, 4, 8, 16
 
 
 def body_name(agent: int, link: str) -> str:
@@ -89,8 +89,8 @@ def _add_agent(spec: mujoco.MjSpec, scene: Scene, agent: int) -> None:
                 shape,
                 name=f"{body_name(agent, link.name)}:{k}",
                 friction=(friction, 0.005, 0.0001),
-                contype=_FINGER if finger else _ATHLETE,
-                conaffinity=_SOLID if finger else _SOLID | _GROUND | _ATHLETE,
+                contype=_FINGER if finger else _SOLID | _ATHLETE,
+                conaffinity=_OBJECT if finger else _SOLID | _GROUND,
                 condim=3,
                 solref=CONTACT_SOLREF,
                 solimp=CONTACT_SOLIMP,
@@ -146,30 +146,32 @@ def _add_object(spec: mujoco.MjSpec, obj: SceneObject, timestep: float) -> None:
     node = spec.worldbody.add_body(
         name=obj.name, pos=obj.pos, quat=obj.quat, mocap=obj.motion == "mocap"
     )
-    if obj.motion == "free":
+    if obj.motion in ("free", "ball"):
         node.add_freejoint(name=obj.name)
     for shape in obj.shapes:
         fields: dict[str, object] = {
             "friction": (obj.friction, 0.005, 0.0001),
-            "contype": _REST if obj.holdable or obj.grip else _SOLID,
-            "conaffinity": _SOLID | _REST | (_GROUND if obj.meets_ground else 0),
+            "contype": _SOLID | _OBJECT,
+            "conaffinity": _SOLID | (_GROUND if obj.meets_ground else 0),
             "condim": 3,
             "rgba": obj.rgba,
         }
+        if obj.motion == "ball":
+            fields |= {"contype": 0, "conaffinity": 0}
         if obj.solref is not None:
             fields["solref"] = obj.solref
         if obj.restitution is not None:
             fields |= _bounce(obj, timestep)
-        _add_shape(node, shape, **fields)
-        if obj.holdable or obj.grip:
-            fields |= {"contype": 0, "conaffinity": _ATHLETE | _FINGER}
-            fields |= {"priority": 1, "condim": 3}
-            if obj.restitution is not None:
-                fields["friction"] = (obj.grip, 0.005, 0.0001)
+        if obj.grip or obj.holdable:
+            # Athletes meet a geom of their own.
+            met = fields | {"contype": 0, "conaffinity": _ATHLETE | _FINGER, "condim": 3}
+            met["friction"] = (obj.grip or obj.friction, 0.005, 0.0001)
             if obj.holdable:
-                fields["solref"] = HOLD_SOLREF
-                fields["solimp"] = (HOLD_IMPEDANCE, HOLD_IMPEDANCE, 0.001, 0.5, 2.0)
-            _add_shape(node, replace(shape, mass=0.0), **fields)
+                met |= {"priority": 1, "solref": HOLD_SOLREF}
+                met["solimp"] = (HOLD_IMPEDANCE, HOLD_IMPEDANCE, 0.001, 0.5, 2.0)
+            _add_shape(node, replace(shape, mass=0.0), **met)
+            fields |= {"contype": 0, "conaffinity": (_GROUND if obj.meets_ground else 0) | _OBJECT}
+        _add_shape(node, shape, **fields)
 
 
 def _side(scene: Scene, name: str) -> tuple[mujoco.mjtObj, str]:

@@ -447,14 +447,16 @@ def keep(
     root: Vector,
     axes: Columns,
     constraint: np.ndarray,
+    applied: np.ndarray,
     qpos: np.ndarray,
     qvel: np.ndarray,
 ) -> tuple[Vector, Vector, Vector]:
     """Corrects the root of world ``w``; see ``momentum.AthleteKeeper.correct``.
 
     ``inertia`` to ``axes``: the athlete as a whole and its root. ``constraint`` (6,), ``qpos``
-    (7,), ``qvel`` (6,): of the free joint, in that world. Returns what was added: rotation,
-    velocity of the centre of mass, shift.
+    (7,), ``qvel`` (6,): of the free joint, in that world. ``applied`` (6,): force, moment about the
+    world's origin, of what else acts from outside. Returns what was added: rotation, velocity of
+    the centre of mass, shift.
     """
     arm, linear = subtract(root, com), times(kept.mass, velocity)
     # The generalised force of the root as a wrench at the centre of mass.
@@ -463,6 +465,9 @@ def keep(
     moment = add(cross(arm, force), combine(axes, local))
     size = abs(force[0]) + abs(force[1]) + abs(force[2])
     size += abs(local[0]) + abs(local[1]) + abs(local[2])
+    push = (applied[0], applied[1], applied[2])
+    moment = add(moment, subtract((applied[3], applied[4], applied[5]), cross(com, push)))
+    force = add(force, push)
     force = (force[0], force[1], force[2] + kept.weight)
     if current:
         advance(kept, w, moment, force)
@@ -494,6 +499,7 @@ def keep_measured(
     motion: np.ndarray,
     inertia: np.ndarray,
     constraint: np.ndarray,
+    applied: np.ndarray,
     qpos: np.ndarray,
     qvel: np.ndarray,
     added: np.ndarray,
@@ -501,8 +507,8 @@ def keep_measured(
     """Corrects the roots of N athletes from the engine's own fields.
 
     ``motion`` (N, 21) of ``mjcf.WHOLE_SENSORS``, ``inertia`` (N, 6) about the centres of mass,
-    ``constraint`` (N, 6), ``qpos`` (N, 7), ``qvel`` (N, 6); writes to the last two, and what was
-    added to ``added`` (N, 9): rotation, velocity of the centre of mass, shift.
+    ``constraint`` and ``applied`` (N, 6), ``qpos`` (N, 7), ``qvel`` (N, 6); writes to the last two,
+    and what was added to ``added`` (N, 9): rotation, velocity of the centre of mass, shift.
     """
     for w in range(len(motion)):
         m, i = motion[w], inertia[w]
@@ -517,6 +523,7 @@ def keep_measured(
             (m[9], m[10], m[11]),
             ((m[12], m[13], m[14]), (m[15], m[16], m[17]), (m[18], m[19], m[20])),
             constraint[w],
+            applied[w],
             qpos[w],
             qvel[w],
         )
@@ -529,6 +536,7 @@ def finish_athlete(
     tree: Tree,
     kept: Kept,
     constraint: np.ndarray,
+    applied: np.ndarray,
     qpos: np.ndarray,
     qvel: np.ndarray,
     out: Athlete,
@@ -536,7 +544,7 @@ def finish_athlete(
     """Keeps an athlete's momentum after the last substep of a control step and shows it.
 
     ``constraint`` (N, nv), ``qpos`` (N, nq) and ``qvel`` (N, nv) are the engine's; writes to the
-    last two.
+    last two. ``applied`` (N, 6) as for ``keep``.
     """
     pose = new_pose(len(tree.parent))
     q, v = tree.qpos, tree.qvel
@@ -554,6 +562,7 @@ def finish_athlete(
             row(pose.pos, 0),
             axes_of(pose, 0),
             constraint[w, v : v + 6],
+            applied[w],
             qpos[w, q : q + 7],
             qvel[w, v : v + 6],
         )

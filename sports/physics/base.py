@@ -31,9 +31,11 @@ class PhysicsState:
     """(N, nv); a root's angular velocity in its own frame, as in MuJoCo."""
     mocap_pos: Tensor
     """(N, M, 3) positions of the movable fixtures."""
+    wave_phase: Tensor | None = None
+    """(N, 2) as ``Physics.wave_phase``; None to leave them as they are."""
 
     def clone(self) -> PhysicsState:
-        return PhysicsState(self.qpos.clone(), self.qvel.clone(), self.mocap_pos.clone())
+        return PhysicsState(**{k: v.clone() for k, v in vars(self).items() if v is not None})
 
 
 class Physics(Protocol):
@@ -83,6 +85,15 @@ class Physics(Protocol):
     """(N, O, 3) world frame."""
     object_angvel: Tensor
     """(N, O, 3) world frame."""
+    ball_hits: Tensor
+    """(N, S) int32, impacts of the ball of the ball law on each of ``Scene.surfaces`` in the last
+    control step. A ball that rolls has one in every substep, one at rest has none."""
+    ball_hit_time: Tensor
+    """(N, S) seconds from the beginning of the control step to the first of them, else inf."""
+    ball_hit_pos: Tensor
+    """(N, S, 3) centre of the ball at the first of them, else zero."""
+    wave_phase: Tensor
+    """(N, 2) phases a and b of the waves of the scene (rad); set by a reset."""
     bad: Tensor
     """(N,) bool: the last step left NaN or absurd numbers, or overflowed a buffer, in this
     world. The caller must reset it; until then its tensors are meaningless."""
@@ -129,6 +140,7 @@ def default_state(scene: Scene, num_worlds: int, device: torch.device | str) -> 
         qpos=rows(scene.default_qpos()),
         qvel=torch.zeros(num_worlds, scene.nv, device=device),
         mocap_pos=rows(scene.default_mocap_pos()),
+        wave_phase=torch.zeros(num_worlds, 2, device=device) if scene.has_waves else None,
     )
 
 

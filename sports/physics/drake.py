@@ -26,12 +26,14 @@ import torch
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import GeometryId
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, QuaternionFloatingJoint, RigidBody
 from pydrake.systems.framework import Context
 from torch import Tensor
 
 from sports import quaternion
+from sports.ball_law.compiled import for_cpu
 from sports.humanoid.drake_plant import (
     OBJECT_DISSIPATION,
     OBJECT_STIFFNESS,
@@ -46,7 +48,9 @@ from sports.humanoid.drake_plant import (
     rotate,
     start_plant,
 )
+from sports.humanoid.mjcf import build_model
 from sports.physics.base import Geometry, PhysicsState, diverged
+from sports.physics.game import build_game, has_game
 from sports.scene import GROUND, Scene, SceneObject
 
 MAX_TIMESTEP = 1.0 / 480.0
@@ -124,6 +128,8 @@ class DrakePhysics:
         self._targets = [plant.get_desired_state_input_port(h.instance) for h in self._humanoids]
         self._mocap_rows = {o.name: k for k, o in enumerate(scene.mocap_objects)}
         self._index_contacts()
+        self._qpos, self._qvel = np.zeros((n, scene.nq)), np.zeros((n, scene.nv))
+        self._add_game()
 
         agents, links, free = scene.num_agents, scene.body.num_links, len(self._free)
         self._links = [link for h in self._humanoids for link in h.links]
@@ -168,11 +174,16 @@ class DrakePhysics:
         mocap = state.mocap_pos.double().cpu().numpy()
         for world in torch.nonzero(mask).ravel().tolist():
             self._place(world, qpos[world], qvel[world], mocap[world])
+            self._forget_ball(world)
+            if state.wave_phase is not None:
+                self.wave_phase[world] = state.wave_phase[world]
         self._publish()
 
     def move(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         forces = self._ground.copy(), self._pair.copy(), self._others.copy()
-        self.reset(mask, PhysicsState(qpos, qvel, self.mocap_pos))
+        positions, velocities = qpos.double().cpu().numpy(), qvel.double().cpu().numpy()
+        for world in torch.nonzero(mask).ravel().tolist():
+            self._place(world, positions[world], velocities[world], self._mocap[world])
         self._ground, self._pair, self._others = forces
         self._publish()
 
@@ -196,12 +207,23 @@ class DrakePhysics:
             wanted = np.zeros(2 * n)
             wanted[:n] = targets[a * n : (a + 1) * n]
             port.FixValue(context, wanted)
+        game, state, law = self._game, (self._qpos, self._qvel), self._law
+        if game is not None and law is not None:
+            self._read_states(slice(world, world + 1))
+            law.begin_world(game, world, *state)
         for _ in range(self.substeps):
+            if game is not None and law is not None:
+                law.push_world(game, world, self.timestep, *state)
+                self._push(world)
             try:
                 self.diagram.ExecuteForcedEvents(root, publish=False)
             except RuntimeError:  # the contact solver or a NaN check gave up on this world
                 return False
             self._collect_contacts(world, context)
+            if game is not None and law is not None:
+                self._read_states(slice(world, world + 1))
+                law.finish_world(game, world, self.timestep, *state)
+        self._put_ball(world)
         return bool(np.isfinite(self.plant.GetPositionsAndVelocities(context)).all())
 
     def _place(self, world: int, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
@@ -229,6 +251,72 @@ class DrakePhysics:
         self._mocap[world] = mocap
         for forces in (self._ground, self._pair, self._others):
             forces[world : world + 1] = 0.0
+
+    # ---- the ball law ---------------------------------------------------------------------
+
+    def _add_game(self) -> None:
+        """The ball and the drag, if the scene has any; the tensors that tell of the ball."""
+        scene, n = self.scene, self.num_worlds
+        self._game, self._law, self._pushed = None, None, [False] * n
+        if has_game(scene):
+            self._game, self._law = build_game(scene, build_model(scene), n), for_cpu()
+            rigids = {
+                f"agent{a}/{link.name()}": link
+                for a, h in enumerate(self._humanoids)
+                for link in h.links
+            }
+            rigids |= {o.name: o.rigid for o in self._free}
+            tools = [s.link for s in scene.surfaces if s.link is not None]
+            names = [*dict.fromkeys(tools), *(o.name for o in scene.objects if o.drag is not None)]
+            self._pushes = [(rigids[name].index(), rigids[name].default_com()) for name in names]
+        surfaces = len(scene.surfaces) if scene.ball is not None else 0
+        hits, times = np.zeros((n, surfaces), np.int32), np.full((n, surfaces), np.inf, np.float32)
+        places, phases = np.zeros((n, surfaces, 3), np.float32), np.zeros((n, 2), np.float32)
+        if self._game is not None and scene.ball is not None:
+            shown = {"hits": hits, "hit_time": times, "hit_pos": places, "phases": phases}
+            self._game = self._game._replace(**shown)
+        self.ball_hits, self.ball_hit_time = torch.from_numpy(hits), torch.from_numpy(times)
+        self.ball_hit_pos = torch.from_numpy(places)
+        self.wave_phase = torch.from_numpy(phases)
+
+    def _forget_ball(self, world: int) -> None:
+        """Impacts of the ball in this world were not."""
+        if self._game is not None:
+            self._game.pending[world] = 0.0
+            self.ball_hits[world], self.ball_hit_time[world] = 0, torch.inf
+            self.ball_hit_pos[world] = 0.0
+
+    def _push(self, world: int) -> None:
+        """Applies what the law wants applied in the next step."""
+        assert self._game is not None
+        wrench = self._game.wrench[world]
+        if not (wrench.any() or self._pushed[world]):
+            return  # nothing new: what the plant has worked out stays valid
+        self._pushed[world] = bool(wrench.any())
+        forces = []
+        for (index, center), row in zip(self._pushes, wrench):
+            force = ExternallyAppliedSpatialForce()
+            force.body_index, force.p_BoBq_B = index, center
+            force.F_Bq_W = SpatialForce(tau=row[3:], f=row[:3])
+            forces.append(force)
+        port = self.plant.get_applied_spatial_force_input_port()
+        port.FixValue(self._contexts[world], forces)
+
+    def _put_ball(self, world: int) -> None:
+        """Puts the ball where the law has it. In between the plant does not need to know: nothing
+        in it touches the ball."""
+        if self.scene.ball is None:
+            return
+        name, context = self.scene.ball.name, self._contexts[world]
+        joint = next(o.joint for o in self._free if o.name == name)
+        p, quat = np.split(self._qpos[world, self.scene.object_qpos(name)], [3])
+        linear, spin = np.split(self._qvel[world, self.scene.object_qvel(name)], [3])
+        q, v = self.plant.GetPositions(context), self.plant.GetVelocities(context)
+        start, start_v = _floating(joint)
+        q[start : start + 7] = (*quat, *p)
+        v[start_v : start_v + 6] = (*rotate(quat, spin), *linear)
+        self.plant.SetPositions(context, q)
+        self.plant.SetVelocities(context, v)
 
     def _index_contacts(self) -> None:
         """Tables from Drake's body indices to links and to the scene's pairs."""
@@ -300,33 +388,31 @@ class DrakePhysics:
 
     # ---- tensors --------------------------------------------------------------------------
 
-    def _read_states(self) -> None:
-        """qpos and qvel of every world in MuJoCo's convention, float32."""
+    def _read_states(self, worlds: slice = slice(None)) -> None:
+        """qpos and qvel of worlds in MuJoCo's convention; their tensors, if of all worlds."""
         scene, plant = self.scene, self.plant
-        for world, context in enumerate(self._contexts):
-            self._q[world] = plant.GetPositions(context)
-            self._v[world] = plant.GetVelocities(context)
-        qpos = np.zeros((self.num_worlds, scene.nq))
-        qvel = np.zeros((self.num_worlds, scene.nv))
+        for world in range(self.num_worlds)[worlds]:
+            self._q[world] = plant.GetPositions(self._contexts[world])
+            self._v[world] = plant.GetVelocities(self._contexts[world])
+        own_q, own_v = self._q[worlds], self._v[worlds]
+        qpos, qvel = self._qpos[worlds], self._qvel[worlds]
         with np.errstate(invalid="ignore", divide="ignore"):
             for a, humanoid in enumerate(self._humanoids):
                 qpos[:, scene.agent_qpos(a)], qvel[:, scene.agent_qvel(a)] = humanoid.from_drake(
-                    self._q[:, humanoid.q_index], self._v[:, humanoid.v_index]
+                    own_q[:, humanoid.q_index], own_v[:, humanoid.v_index]
                 )
             for obj in self._free:
                 start, start_v = _floating(obj.joint)
-                quat = self._q[:, start : start + 4]
+                quat = own_q[:, start : start + 4]
                 quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
-                w_W = self._v[:, start_v : start_v + 3]
+                w_W = own_v[:, start_v : start_v + 3]
                 w_B = rotate(quat * np.array([1.0, -1.0, -1.0, -1.0]), w_W)
-                p_WB, v_WB = (
-                    self._q[:, start + 4 : start + 7],
-                    self._v[:, start_v + 3 : start_v + 6],
-                )
+                p_WB, v_WB = own_q[:, start + 4 : start + 7], own_v[:, start_v + 3 : start_v + 6]
                 qpos[:, scene.object_qpos(obj.name)] = np.concatenate([p_WB, quat], axis=-1)
                 qvel[:, scene.object_qvel(obj.name)] = np.concatenate([v_WB, w_B], axis=-1)
-        self.qpos = torch.from_numpy(qpos.astype(np.float32))
-        self.qvel = torch.from_numpy(qvel.astype(np.float32))
+        if worlds == slice(None):
+            self.qpos = torch.from_numpy(self._qpos.astype(np.float32))
+            self.qvel = torch.from_numpy(self._qvel.astype(np.float32))
 
     def _publish(self) -> None:
         """Brings every tensor of the protocol up to date with the contexts."""
@@ -386,7 +472,7 @@ def _add_object(
     instance = plant.AddModelInstance(obj.name)
     rigid = plant.AddRigidBody(obj.name, instance, link_inertia(obj.shapes))
     frame, joint = None, None
-    if obj.motion == "free":
+    if obj.motion in ("free", "ball"):
         damping = obj.rolling_damping() if obj.rolling else 0.0
         joint = QuaternionFloatingJoint(
             obj.name, plant.world_frame(), rigid.body_frame(), angular_damping=damping
@@ -396,6 +482,8 @@ def _add_object(
         X_WF = RigidTransform(Quaternion(np.array(obj.quat, dtype=float)), np.array(obj.pos))
         frame = plant.AddFrame(FixedOffsetFrame(f"{obj.name}_fixture", plant.world_frame(), X_WF))
         plant.WeldFrames(frame, rigid.body_frame())
+    if obj.motion == "ball":  # touches what the ball law says
+        return _Object(obj.name, rigid, frame, joint, obj.quat)
     if obj.restitution is not None:
         own = _add_ball(plant, rigid, obj, timestep)
     else:

@@ -9,7 +9,8 @@ the momentum of the whole body back to
     h[k+1] = h[k] + dt (gravity + contact wrench),
 
 which holds for any rigid-body system (Newton and Euler; Featherstone 2008, section 2.13). Contact
-forces are the engine's own: the constraint forces on the free joint of the root. In flight the
+forces are the engine's own: the constraint forces on the free joint of the root; what is applied to
+a link besides (the impact of a ball) is told. In flight the
 centre of mass is also put back on the path of that momentum; on the ground the contacts decide.
 
 Momentum is taken at the centre of mass, world axes: ``(L, P)``, N m s and N s.
@@ -49,7 +50,12 @@ class AthleteKeeper:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, bind: Bind, root: str, num_worlds: int | None = None
+        self,
+        model: mujoco.MjModel,
+        bind: Bind,
+        root: str,
+        num_worlds: int | None = None,
+        applied: np.ndarray | None = None,
     ) -> None:
         """
         Args:
@@ -57,6 +63,8 @@ class AthleteKeeper:
             bind: gives a live (N, ...) array of an MjData field; ``Batch.bind`` or ``rows_of``.
             root: name of the athlete's root body, the one with the free joint.
             num_worlds: keep the first so many simulations; None for all.
+            applied: live array (N, 6) of what else acts on the athlete from outside in a substep,
+                force (N) and moment about the world's origin (N m), world frame; None for nothing.
 
         Raises:
             ValueError: the model lacks a sensor of the athlete.
@@ -69,10 +77,15 @@ class AthleteKeeper:
         q, v = model.jnt_qposadr[body.jntadr[0]], model.jnt_dofadr[body.jntadr[0]]
         first = model.sensor(f"{WHOLE_SENSORS[0].lower()}:{root}").adr[0]
         self._motion = bind("sensordata")[n, first : first + 3 * len(WHOLE_SENSORS)]
+        if applied is None:
+            applied = np.zeros((len(self._motion), 6))
+        self.applied = applied
+        """(N, 6) force and moment about the world's origin; see ``__init__``."""
         self._fields = (
             self._motion,
             bind("crb")[n, body.id, :6],
             bind("qfrc_constraint")[n, v : v + 6],
+            applied,
             bind("qpos")[n, q : q + 7],
             bind("qvel")[n, v : v + 6],
         )

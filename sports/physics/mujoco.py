@@ -57,6 +57,8 @@ class MujocoPhysics:
         self.object_linvel, self.object_angvel = shown.object_linvel, shown.object_angvel
         self.ground_force, self.pair_force = shown.ground_force, shown.pair_force
         self.link_force = shown.link_force
+        self.ball_hits, self.ball_hit_time = shown.ball_hits, shown.ball_hit_time
+        self.ball_hit_pos, self.wave_phase = shown.ball_hit_pos, shown.wave_phase
         self.bad = torch.from_numpy(out.bad)
         self.nan_worlds = 0
         self.overflow = 0
@@ -66,6 +68,7 @@ class MujocoPhysics:
             self.nan_worlds += int(self.bad.sum())
             safe = default_state(self.scene, self.num_worlds, self.device)
             safe.mocap_pos = self.mocap_pos.clone()
+            safe.wave_phase = None
             self.reset(self.bad, safe)
 
     def reset(self, mask: Tensor, state: PhysicsState) -> None:
@@ -79,6 +82,8 @@ class MujocoPhysics:
         qpos, qvel = state.qpos.double().numpy(), state.qvel.double().numpy()
         show(self.scene, self._trees, qpos, qvel, out)
         out.mocap_pos[:] = state.mocap_pos.permute(1, 2, 0).numpy()
+        phase = self.wave_phase if state.wave_phase is None else state.wave_phase
+        out.wave_phase[:] = phase.numpy()
         return Shown(self.scene, self.geometry, out)
 
     def restart(self, worlds: Tensor, prepared: Shown) -> None:
@@ -106,12 +111,16 @@ class MujocoPhysics:
             "target": np.stack([keeper.target for keeper in keepers]),
             "path": np.stack([keeper.path for keeper in keepers]),
         }
+        if worlds.game is not None:
+            arrays["pending"] = worlds.game.pending.copy()
         return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
     def load_extra_state(self, state: dict[str, Tensor]) -> None:
         """Restores :meth:`extra_state`; call after ``reset``."""
         names = ("qpos", "qvel", "qacc_warmstart", "target", "path")
         self._worlds.load(*(state[name].numpy() for name in names))
+        if self._worlds.game is not None:
+            self._worlds.game.pending[:] = state["pending"].numpy()
 
     def close(self) -> None:
         self.__dict__.pop("_worlds", None)

@@ -90,6 +90,15 @@ class Results:
         """(P, N) as ``Physics.pair_force``"""
         self.link_force = parts["link_force"]
         """(3, A B, N) as ``Physics.link_force``; (3, 0, N) where nobody asks for it."""
+        surfaces = len(scene.surfaces) if scene.ball is not None else 0
+        self.ball_hits = np.zeros((num_worlds, surfaces), np.int32)
+        """(N, S) as ``Physics.ball_hits``"""
+        self.ball_hit_time = np.full((num_worlds, surfaces), np.inf, np.float32)
+        """(N, S) as ``Physics.ball_hit_time``"""
+        self.ball_hit_pos = np.zeros((num_worlds, surfaces, 3), np.float32)
+        """(N, S, 3) as ``Physics.ball_hit_pos``"""
+        self.wave_phase = np.zeros((num_worlds, 2), np.float32)
+        """(N, 2) as ``Physics.wave_phase``"""
         self.bad = np.zeros(num_worlds, np.bool_)
         """(N,) bool: the numbers of the state are those of ``sports.physics.base.diverged``."""
 
@@ -103,7 +112,14 @@ class Results:
         ones or ``chosen`` ones."""
         chosen = worlds if chosen is None else chosen
         copy_worlds(source.by_world, chosen, worlds, self._all)
-        self.felt[worlds] = source.felt[chosen]
+        for own, other in zip(self.rows, source.rows):
+            own[worlds] = other[chosen]
+
+    @property
+    def rows(self) -> tuple[np.ndarray, ...]:
+        """Arrays (N, ...) that are not in the one array."""
+        balls = (self.ball_hits, self.ball_hit_time, self.ball_hit_pos, self.wave_phase)
+        return (self.felt, *balls) if self.ball_hits.shape[1] else (self.felt,)
 
     def athlete(self, agent: int) -> Athlete:
         """What is shown of an athlete; views."""
@@ -139,6 +155,10 @@ class Shown:
         self.body_linvel, self.body_angvel = _turned(links.linvel), _turned(links.angvel)
         self.body_rot = torch.from_numpy(results.rotation).permute(4, 2, 3, 0, 1)
         self.felt = torch.from_numpy(results.felt)
+        self.ball_hits = torch.from_numpy(results.ball_hits)
+        self.ball_hit_time = torch.from_numpy(results.ball_hit_time)
+        self.ball_hit_pos = torch.from_numpy(results.ball_hit_pos)
+        self.wave_phase = torch.from_numpy(results.wave_phase)
         self.whole = _turned(results.whole)
         self.object_pos, self.object_quat = _turned(objects.pos), _turned(objects.quat)
         self.object_linvel, self.object_angvel = _turned(objects.linvel), _turned(objects.angvel)

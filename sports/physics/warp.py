@@ -15,9 +15,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from sports.ball_law.compiled import for_gpu
 from sports.humanoid.body import is_finger
 from sports.humanoid.mjcf import body_name, build_model
 from sports.physics.base import GRAVITY, NO_FORCE, Geometry, PhysicsState, diverged
+from sports.physics.game import build_game, has_game
 from sports.physics.variation import Draw, Variation, contact_softness, draw
 from sports.scene import GROUND, Scene
 
@@ -141,6 +143,7 @@ def _keep_largest(
 def _keep_momentum(
     cinert: wp.array3d(dtype=float),  # type: ignore[valid-type]
     qfrc_constraint: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    applied: wp.array3d(dtype=float),  # type: ignore[valid-type]
     timestep: wp.array(dtype=float),  # type: ignore[valid-type]
     tree: wp.array2d(dtype=int),  # type: ignore[valid-type]
     links: int,
@@ -184,8 +187,11 @@ def _keep_momentum(
     force = wp.vec3(qfrc_constraint[w, v], qfrc_constraint[w, v + 1], qfrc_constraint[w, v + 2])
     local = wp.vec3(qfrc_constraint[w, v + 3], qfrc_constraint[w, v + 4], qfrc_constraint[w, v + 5])
     flying = wp.length(force) + wp.length(local) < wp.static(NO_FORCE)
-    impulse_l = h * (turn @ local + wp.cross(arm, force))
-    impulse_p = h * (force + wp.vec3(0.0, 0.0, wp.static(-GRAVITY) * mass))
+    push = wp.vec3(applied[w, a, 0], applied[w, a, 1], applied[w, a, 2])
+    moment = wp.vec3(applied[w, a, 3], applied[w, a, 4], applied[w, a, 5])
+    moment += turn @ local + wp.cross(arm, force) - wp.cross(center, push)
+    impulse_l = h * moment
+    impulse_p = h * (force + push + wp.vec3(0.0, 0.0, wp.static(-GRAVITY) * mass))
 
     error_l = wp.vec3(0.0, 0.0, 0.0)
     error_p = wp.vec3(0.0, 0.0, 0.0)
@@ -228,6 +234,27 @@ def _keep_momentum(
                 cvel[w, root + k, i] = cvel[w, root + k, i] + spin_change[i]
                 cvel[w, root + k, 3 + i] = cvel[w, root + k, 3 + i] + speed_change[i]
                 xpos[w, root + k, i] = xpos[w, root + k, i] + shift[i]
+
+
+@wp.kernel
+def _show_ball(
+    state: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    body: int,
+    xpos: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    xquat: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    com: wp.array3d(dtype=float),  # type: ignore[valid-type]
+    cvel: wp.array3d(dtype=float),  # type: ignore[valid-type]
+):
+    """Shows where the ball law has put the ball; the engine had looked before. ``state`` as
+    ``Game.state``: position, quaternion, velocity, spin."""
+    w = wp.tid()
+    for k in range(3):
+        xpos[w, body, k] = state[w, k]
+        com[w, body, k] = state[w, k]
+        cvel[w, body, k] = state[w, 10 + k]
+        cvel[w, body, 3 + k] = state[w, 7 + k]
+    for k in range(4):
+        xquat[w, body, k] = state[w, 3 + k]
 
 
 def _contact_tables(
@@ -368,6 +395,15 @@ class WarpPhysics:
         fields = (d.cvel, d.subtree_com, d.xpos, d.xquat)
         self._kept = [wp.from_torch(view(d.cinert)), *(wp.from_torch(view(x)) for x in fields)]
         self._kept += [wp.from_torch(x) for x in (self._known, self._target, self._path)]
+        self._game: dict[str, Tensor] = self._new_game() if has_game(scene) else {}
+        surfaces = len(scene.surfaces) if scene.ball is not None else 0
+        nothing = torch.zeros(n, surfaces, device=self.device)
+        self.ball_hits = self._game.get("hits", nothing.int())
+        self.ball_hit_time = self._game.get("hit_time", nothing)
+        self.ball_hit_pos = self._game.get("hit_pos", nothing[..., None].expand(-1, -1, 3))
+        self.wave_phase = self._game.get("phases", torch.zeros(n, 2, device=self.device))
+        applied = torch.zeros(n, agents, 6, device=self.device)
+        self._applied = wp.from_torch(self._game.get("applied", applied))
         self._forces = torch.zeros(n, sensors, 3, device=self.device)
         self._largest = torch.zeros(n, sensors, device=self.device)
         self._wp_forces = wp.from_torch(self._forces)
@@ -390,6 +426,7 @@ class WarpPhysics:
         for t in (self.qvel, self._ctrl, self._warmstart, self._forces, self._overflow):
             t.zero_()
         self._known.zero_()
+        self._forget_ball(torch.ones(n, dtype=torch.bool, device=self.device))
         self._run(self._refresh_graph, self._refresh)
         self._derive()
 
@@ -417,6 +454,9 @@ class WarpPhysics:
             self.mocap_pos.copy_(torch.where(row[..., None], state.mocap_pos, self.mocap_pos))
         self._forces.masked_fill_(row[..., None], 0.0)
         self._known.masked_fill_(row, 0)
+        self._forget_ball(mask)
+        if state.wave_phase is not None:
+            self.wave_phase.copy_(torch.where(row, state.wave_phase, self.wave_phase))
         self._run(self._refresh_graph, self._refresh)
         self._derive()
 
@@ -436,12 +476,13 @@ class WarpPhysics:
 
     def extra_state(self) -> dict[str, Tensor]:
         """The solver's warm start and the momentum expected."""
-        return {
+        kept = {
             "qacc_warmstart": self._warmstart.clone(),
             "known": self._known.clone(),
             "target": self._target.clone(),
             "path": self._path.clone(),
         }
+        return kept | ({"pending": self._game["pending"].clone()} if self._game else {})
 
     def load_extra_state(self, state: dict[str, Tensor]) -> None:
         """Restores :meth:`extra_state`; call after ``reset``."""
@@ -449,6 +490,8 @@ class WarpPhysics:
         self._known.copy_(state["known"])
         self._target.copy_(state["target"])
         self._path.copy_(state["path"])
+        if self._game:
+            self._game["pending"].copy_(state["pending"])
 
     def close(self) -> None:
         self._step_graph = self._refresh_graph = None
@@ -478,10 +521,40 @@ class WarpPhysics:
         if timesteps is not None:
             self._timesteps = [wp.array(h.astype(np.float32), dtype=float) for h in timesteps]
 
+    def _new_game(self) -> dict[str, Tensor]:
+        """The ball and the drag as tensors; ``self._wp_game`` is what the kernels get of them."""
+        wrench = wp.to_torch(self.d.xfrc_applied)
+        built = build_game(self.scene, self.model, self.num_worlds, np.zeros(wrench.shape))
+        tensors = {"wrench": wrench}
+        self._wp_game = for_gpu().Game()
+        for name, array in built._asdict().items():
+            dtype = torch.int32 if array.dtype == np.int32 else torch.float32
+            if name not in tensors:
+                tensors[name] = torch.tensor(array, dtype=dtype, device=self.device)
+            setattr(self._wp_game, name, wp.from_torch(tensors[name]))
+        return tensors
+
+    def _forget_ball(self, mask: Tensor) -> None:
+        """Impacts of the ball in worlds of a mask (N,) were not."""
+        if self._game:
+            row = mask[:, None]
+            self.ball_hits.masked_fill_(row, 0)
+            self.ball_hit_time.masked_fill_(row, torch.inf)
+            self.ball_hit_pos.masked_fill_(row[..., None], 0.0)
+            self._game["pending"].masked_fill_(row[..., None], 0.0)
+
+    def _ask_law(self, kernel: str, *timestep: wp.array) -> None:
+        """Launches a kernel of the ball law, by its name."""
+        if self._game:
+            inputs = [self._wp_game, *timestep, self.d.qpos, self.d.qvel]
+            wp.launch(getattr(for_gpu(), kernel), dim=self.num_worlds, inputs=inputs)
+
     def _substeps(self) -> None:
         d = self.d
+        self._ask_law("begin_worlds")
         for i in range(self.scene.substeps):
             self.m.opt.timestep = self._timesteps[i]
+            self._ask_law("push_worlds", self._timesteps[i])
             mjw.step(self.m, d)
             mjw.contact_force(self.m, d, self._contact_ids, True, self._contact_force)
             wp.launch(
@@ -512,6 +585,13 @@ class WarpPhysics:
             if last:
                 self._refresh()
             self._correct(self._timesteps[i], last)
+            self._ask_law("finish_worlds", self._timesteps[i])
+        if self.scene.ball is not None:
+            cvel, com, xpos, xquat = self._kept[1:5]
+            state = wp.from_torch(self._game["state"])
+            body = self.model.body(self.scene.ball.name).id
+            outputs = [xpos, xquat, com, cvel]
+            wp.launch(_show_ball, dim=self.num_worlds, inputs=[state, body], outputs=outputs)
 
     def _roll_balls(self, timestep: wp.array) -> None:
         for i, ball in enumerate(self.scene.bouncing):
@@ -541,6 +621,7 @@ class WarpPhysics:
             inputs=[
                 cinert,
                 self.d.qfrc_constraint,
+                self._applied,
                 timestep,
                 self._tree,
                 self.scene.body.num_links,

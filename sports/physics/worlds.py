@@ -11,8 +11,11 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from sports.ball_law.compiled import for_cpu
+from sports.ball_law.contact import Game
 from sports.humanoid.mjcf import body_name
 from sports.physics.athletes import Tree, finish_athlete, look_at_contacts, roll_ball
+from sports.physics.game import build_game, has_game
 from sports.physics.momentum import AthleteKeeper
 from sports.physics.results import Results, show, show_state
 from sports.physics.variation import Draw, contact_softness
@@ -71,8 +74,17 @@ class Worlds:
         self.warmstart, self._ctrl = batch.bind("qacc_warmstart"), batch.bind("ctrl")
         self._mocap = batch.bind("mocap_pos") if model.nmocap else np.zeros((n, 0, 3))
         self._mocap_rows = [model.body(o.name).mocapid[0] for o in scene.mocap_objects]
+        self.game = self._new_game(model) if has_game(scene) else None
+        """The ball and the drag, if the scene has any."""
+        self._law = for_cpu()
+        applied = np.zeros((n, scene.num_agents, 6)) if self.game is None else self.game.applied
         self.keepers = [
-            AthleteKeeper(model, batch.bind, body_name(agent, body.link_names[0]))
+            AthleteKeeper(
+                model,
+                batch.bind,
+                body_name(agent, body.link_names[0]),
+                applied=applied[:, agent],
+            )
             for agent in range(scene.num_agents)
         ]
         self._athletes = [out.athlete(agent) for agent in range(scene.num_agents)]
@@ -81,6 +93,7 @@ class Worlds:
         self._peaks = np.zeros((n, sensors))
         self._balls = [_Ball(model, ball, n) for ball in scene.bouncing]
         self._timesteps: list[np.ndarray] | None = None
+        self._even = np.full(n, scene.timestep)
         self._softness = model.geom_solref, model.geom_solimp
         if drawn is not None:
             self._vary(drawn)
@@ -90,26 +103,35 @@ class Worlds:
 
     def step(self, ctrl: np.ndarray) -> bool:
         """One control step with targets (n, nu). Whether some world has diverged."""
-        out = self._out
+        out, game, state = self._out, self.game, (self.qpos, self.qvel)
         self._ctrl[:] = ctrl
         forces = out.ground_force, out.pair_force, out.link_force
         for array in (self._peaks, *forces):
             array[:] = 0.0
+        if game is not None:
+            self._law.begin_worlds(game, *state)
         for i in range(self.scene.substeps):
+            last, timestep = i == self.scene.substeps - 1, self._even
             if self._timesteps is not None:
-                self._timestep[:] = self._timesteps[i].reshape(self._timestep.shape)
+                timestep = self._timesteps[i]
+                self._timestep[:] = timestep.reshape(self._timestep.shape)
                 for keeper in self.keepers:
-                    keeper.kept.timestep[:] = self._timesteps[i]
+                    keeper.kept.timestep[:] = timestep
+            if game is not None:
+                self._law.push_worlds(game, timestep, *state)
             self.batch.step()
             look_at_contacts(self._sensors, self._peaks, *forces, TOO_MUCH)
             for ball in self._balls:
-                ball.roll(self.keepers[0].kept.timestep, self._sensors, self.qpos, self.qvel)
-            if i < self.scene.substeps - 1:
-                for keeper in self.keepers:
+                ball.roll(timestep, self._sensors, self.qpos, self.qvel)
+            for tree, keeper, athlete in zip(self._trees, self.keepers, self._athletes):
+                if last:
+                    kept = keeper.kept, self._constraint, keeper.applied
+                    finish_athlete(tree, *kept, *state, athlete)
+                else:
                     keeper.correct(current=False)
-        for tree, keeper, athlete in zip(self._trees, self.keepers, self._athletes):
-            finish_athlete(tree, keeper.kept, self._constraint, self.qpos, self.qvel, athlete)
-        return show_state(self.scene, self.qpos, self.qvel, out)
+            if game is not None:
+                self._law.finish_worlds(game, timestep, *state)
+        return show_state(self.scene, *state, out)
 
     def take(self, ids: np.ndarray) -> None:
         """Puts worlds ``ids`` into the states that ``out`` shows."""
@@ -119,6 +141,8 @@ class Worlds:
             self._mocap[ids, row] = self._out.mocap_pos[k][:, ids].T
         for keeper in self.keepers:
             keeper.forget(ids)
+        if self.game is not None:
+            self.game.pending[ids] = 0.0
 
     def move(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Changes the states of worlds ``ids`` to (n, nq), (n, nv), float32, where they differ
@@ -135,6 +159,8 @@ class Worlds:
         show(scene, self._trees, self.qpos[ids], self.qvel[ids], some)
         for name in ("mocap_pos", "ground_force", "pair_force", "link_force"):
             getattr(some, name)[:] = getattr(out, name)[..., ids]
+        for own, shown in zip(some.rows[1:], out.rows[1:]):
+            own[:] = shown[ids]
         out.put(ids, some, np.arange(len(ids)))
 
     def show(self) -> None:
@@ -155,6 +181,16 @@ class Worlds:
         for keeper, expected, where in zip(self.keepers, target, path):
             keeper.target[:], keeper.path[:] = expected, where
         self.show()
+
+    def _new_game(self, model: mujoco.MjModel) -> Game:
+        """Its arrays; impacts are noted where they are shown."""
+        out = self._out
+        wrench = self.batch.bind("xfrc_applied")
+        shown = {"hits": out.ball_hits, "hit_time": out.ball_hit_time, "hit_pos": out.ball_hit_pos}
+        game = build_game(self.scene, model, out.num_worlds, wrench)
+        if self.scene.ball is None:
+            return game
+        return game._replace(phases=out.wave_phase, **shown)
 
     def _vary(self, drawn: Draw) -> None:
         """Gives each world its own numbers; see the ``warp`` engine."""

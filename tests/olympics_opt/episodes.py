@@ -21,6 +21,7 @@ class Episode:
     seed: int = 7
     world: int = 3
     dt: float = 1 / 30
+    shown: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def bar_scene(body: Body | None = None, height: float = 1.5) -> Scene:

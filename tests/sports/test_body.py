@@ -246,6 +246,16 @@ def test_equipment_changes_the_mass_by_its_own(name, tool_mass, replaced):
     assert equipped.equipment == (name,)
 
 
+def test_the_point_of_the_sword_is_a_shape_of_its_own():
+    """One blade of 0.98 m in two shapes: it balances in its middle, and the last 0.05 m score."""
+    body = load_body(equipment=["sword"])
+    blade, point = body.links[body.link_index("R_Hand")].shapes
+    assert blade.end == point.center == (0, -0.93, 0) and point.end == (0, -0.98, 0)
+    assert blade.size == point.size == (0.01,)
+    moment = blade.mass * 0.93 / 2 + point.mass * (0.93 + 0.98) / 2
+    assert moment / (blade.mass + point.mass) == pytest.approx(0.49, abs=1e-5)
+
+
 def test_equipment_list_is_complete():
     assert set(equipment_names()) == {"club", "racket", "paddle", "sword", "gloves"}
 

@@ -16,6 +16,11 @@ def worlds_of(task: str) -> int:
     return 8 if num_agents(task) > 2 or get_task(task).body == "smplx" else 32
 
 
+def env_lasts(task: str) -> bool:
+    """Whether an episode goes on after a fall, for minutes."""
+    return get_task(task).max_steps > 600
+
+
 def actions(env: Env, steps: int, sigma: float = 0.3, seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     shape = (steps, env.num_worlds, env.num_agents, env.action_size)
@@ -102,7 +107,7 @@ def test_permuting_the_worlds_permutes_everything(task):
             other = (b.terms | b.metrics)[name]
             assert torch.equal(value[order].nan_to_num(-1.0), other.nan_to_num(-1.0)), name
         ends += int(a.ended.sum())
-    assert ends >= 3 and len(handed) == len(drawn)
+    assert len(handed) == len(drawn) and (ends >= 3 or env_lasts(task))
     for name, value in straight.curriculum.items():
         assert torch.equal(value[order], permuted.curriculum[name]), name
 

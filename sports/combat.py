@@ -1,0 +1,187 @@
+"""What duels share: an opponent to see, a weapon that reaches for it, touches that count.
+
+Two athletes of one body face each other along x. A weapon is a point of a hand: the tip of a sword,
+the middle of a glove. It scores on the opponent's trunk and head. An athlete's weapons count as
+one: a step in which both gloves land is one point.
+
+Sources: SMPLOlympics, section 4, for goal and reward; World Fencing (FIE) and World Boxing (AIBA)
+rules for what a touch is. A point is an event, not a state: after one, the weapon must leave the
+targets for half a second before the next, so that neither pushing nor holding pays.
+
+Shapes: N worlds, A = 2 athletes, B links, W weapons of each, K targets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from sports.physics.base import GRAVITY
+from sports.task import Advance, Memory, View, constant, squared
+
+TARGETS = ("Pelvis", "Torso", "Spine", "Chest", "Head")
+HALF_DISTANCE = 1.5
+"""From the middle to each athlete at the start (m)."""
+TOUCH_FORCE = 50.0
+"""Force (N) from which a contact is a touch."""
+TOUCH_DISTANCE_SQUARED = 0.1
+"""Of the weapon's point from the target's origin (m^2), the paper's: 0.316 m."""
+REST = 0.5
+"""Seconds without contact before the next point."""
+FACING, VELOCITY, STRIKE, POINT = 0.1, 0.1, 0.6, 1.0
+"""Weights of the reward's terms."""
+WANTED_SPEED = 1.0
+"""Towards the opponent (m/s); more is not paid."""
+MAX_LOAD = 10.0
+"""Body weights up to which forces are shown, so that their squares stay numbers that a network can
+take."""
+ROWS, CONTACTS = 288, 72
+"""``Scene.rows_per_world`` and ``contacts_per_world``: twice the most seen in 32 worlds and 300
+steps of two athletes thrashing on top of each other (144, 35); at play it is about 100 and 25."""
+
+
+@dataclass(frozen=True)
+class Weapon:
+    """What an athlete hits with."""
+
+    link: str
+    side: str
+    """Of a contact pair: the link, or one of its shapes."""
+    length: float
+    """From the link's origin to the weapon's point, along the link's -y (m)."""
+
+
+def contact_pairs(weapons: tuple[Weapon, ...]) -> tuple[tuple[str, str], ...]:
+    """``Scene.contact_pairs``: by athlete, by weapon, by target of the opponent."""
+    return tuple(
+        (f"agent{a}/{weapon.side}", f"agent{1 - a}/{target}")
+        for a in range(2)
+        for weapon in weapons
+        for target in TARGETS
+    )
+
+
+@cache
+def _rows(link_names: tuple[str, ...], wanted: tuple[str, ...], device: torch.device) -> Tensor:
+    return torch.tensor([link_names.index(name) for name in wanted], device=device)
+
+
+def _of(view: View, links: Tensor, wanted: tuple[str, ...]) -> Tensor:
+    """(N, A, k, ...) the wanted of links (N, A, B, ...)."""
+    rows = _rows(view.physics.scene.body.link_names, wanted, links.device)
+    return links.index_select(2, rows)
+
+
+def gaps(view: View, weapons: tuple[Weapon, ...]) -> Tensor:
+    """(N, A, W, K, 3) from the points of the athletes' weapons to the origins of the opponent's
+    targets, world frame (m)."""
+    physics, hands = view.physics, tuple(weapon.link for weapon in weapons)
+    origins, axes = _of(view, physics.body_pos, hands), _of(view, physics.body_rot[..., 1], hands)
+    lengths = constant(tuple(weapon.length for weapon in weapons), origins.device)[:, None]
+    points = torch.addcmul(origins, axes, lengths, value=-1.0)
+    targets = _of(view, physics.body_pos, TARGETS).flip(1)
+    return targets[:, :, None] - points[:, :, :, None]
+
+
+def features(view: View, weapons: tuple[Weapon, ...]) -> dict[str, Tensor]:
+    """The opponent as an athlete sees it, in its own heading frame (204 + 15 W).
+
+    Root position relative to the own root, rotation (first two columns of its matrix), velocity in
+    the world; positions and velocities of all links relative to the own root and its velocity;
+    targets relative to the weapons' points; squared force on each link, own and opponent's, of
+    everything but the ground, in units of the body weight (paper), up to ``MAX_LOAD``.
+    """
+    physics = view.physics
+    pos, linvel = physics.body_pos, physics.body_linvel
+    place = pos.flip(1) - pos[:, :, :1]
+    motion = linvel.flip(1)
+    turn = view.rotation[:, :, 0].flip(1)[..., :2].transpose(2, 3)  # (N, A, 2, 3)
+    parts = {
+        "opponent_pos": place[:, :, :1],
+        "opponent_rot": turn,
+        "opponent_linvel": motion[:, :, :1],
+        "opponent_body_pos": place,
+        "opponent_body_linvel": motion - linvel[:, :, :1],
+        "targets": gaps(view, weapons).flatten(2, 3),
+    }
+    # One rotation for all of them: it is most of the work.
+    seen = view.heading.local(torch.cat(tuple(parts.values()), dim=2)).flatten(2)
+    found = dict(zip(parts, seen.split([3 * part.shape[2] for part in parts.values()], dim=-1)))
+    weight = GRAVITY * view.geometry.mass.sum()
+    load = (squared(physics.link_force) / weight.square()).clamp(max=MAX_LOAD**2)
+    return found | {"own_force": load, "opponent_force": load.flip(1)}
+
+
+def approach(view: View) -> tuple[Tensor, Tensor]:
+    """(N, A) how well an athlete faces its opponent, and how it moves towards it, each in [0, 1].
+
+    exp(-2 (1 - cos)) of the horizontal angle between its heading and the opponent;
+    exp(-4 max(1 - v, 0)^2) of the horizontal speed v of its root towards it (m/s), 0 unless v > 0.
+    """
+    root = view.root_pos
+    ahead, left, _ = view.heading.local(root.flip(1) - root).unbind(-1)
+    vx, vy, _ = view.heading.local(view.root_linvel).unbind(-1)
+    far = torch.hypot(ahead, left).clamp(min=1e-6)
+    facing = torch.exp(2.0 * (ahead / far - 1.0))
+    speed = (vx * ahead + vy * left) / far
+    lacking = (WANTED_SPEED - speed).clamp(min=0.0)
+    return facing, torch.exp(-4.0 * lacking.square()) * (speed > 0.0)
+
+
+def begin(view: View, weapons: tuple[Weapon, ...]) -> Memory:
+    """Memory after a reset: nobody has scored, every weapon may."""
+    squares = squared(gaps(view, weapons))
+    nobody = torch.zeros_like(squares[:, :, 0, 0])
+    return {"squares": squares, "wait": nobody.clone(), "touches": nobody.clone()}
+
+
+def advance(view: View, memory: Memory, weapons: tuple[Weapon, ...], faults: Tensor) -> Advance:
+    """One control step of a bout. ``faults`` (N, A): who ended it by a fall or by leaving; such an
+    athlete has lost, or whoever leads could end the bout by lying down. Otherwise, and where both
+    did, more touches win. Metrics are those of athlete 0; success is a bout it won.
+    """
+    squares = squared(gaps(view, weapons))
+    # The force is the largest of the step's substeps, and the weapon may be off again at its end:
+    # the distance is that of the nearer end.
+    near = torch.minimum(squares, memory["squares"]) <= TOUCH_DISTANCE_SQUARED
+    force = view.physics.pair_force.view(squares.shape)
+    touch = ((force >= TOUCH_FORCE) & near).flatten(2).any(-1)
+    contact = (force > 0.0).flatten(2).any(-1)
+
+    wait = memory["wait"]  # steps without contact before the next point
+    ready = wait <= 0
+    point = touch & ready
+    rest = round(REST / view.control_timestep)
+    wait = torch.where(point | (contact & ~ready), rest, (wait - 1).clamp(min=0))
+    scored = point.float()
+    touches = memory["touches"] + scored
+
+    facing, velocity = approach(view)
+    strike = torch.exp(-10.0 * squares.flatten(2).amin(-1))
+    terms = {
+        "facing": FACING * facing,
+        "velocity": VELOCITY * velocity,
+        "strike": STRIKE * strike,
+        "point": POINT * (scored - scored.flip(1)),
+    }
+
+    mine, theirs = touches.unbind(1)
+    lost, won = faults.unbind(1)
+    margin = torch.where(lost == won, mine - theirs, won.float() - lost.float())
+    win = margin > 0
+    metrics = {
+        "success": win.float(),
+        "draw": (margin == 0).float(),
+        "touches_for": mine,
+        "touches_against": theirs,
+    }
+    return Advance(
+        memory={"squares": squares, "wait": wait, "touches": touches},
+        terms=terms,
+        terminated=faults,
+        metrics=metrics,
+        success=win,
+    )

@@ -1,0 +1,390 @@
+"""Both duels: on guard, the opponent seen, points by hand-made hits, symmetry, three engines."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from sports import combat
+from sports.env import make_env, make_scene
+from sports.physics import PhysicsState, default_state, make_physics
+from tests.sports.bout import Bout, swapped
+
+pytestmark = pytest.mark.parametrize("task", ["fencing", "boxing"])
+
+
+def scattered(env, seed: int) -> PhysicsState:
+    """Athletes near each other in poses and motion of all kinds."""
+    scene, n = env.physics.scene, env.num_worlds
+    generator = torch.Generator().manual_seed(seed)
+    state = default_state(scene, n, "cpu")
+    for agent in range(2):
+        q, v = scene.agent_qpos(agent), scene.agent_qvel(agent)
+        own = state.qpos[:, q]
+        own[:, :2] = 0.6 * torch.randn(n, 2, generator=generator)
+        own[:, 3:7] = torch.nn.functional.normalize(
+            own[:, 3:7] + 0.3 * torch.randn(n, 4, generator=generator)
+        )
+        own[:, 7:] += 0.3 * torch.randn(n, 69, generator=generator)
+        state.qvel[:, v] = torch.randn(n, 75, generator=generator)
+    return state
+
+
+def test_the_guard_is_set_on_the_ground_and_faces_the_opponent(task):
+    bout = Bout(task)
+    bout.begin()
+    physics = bout.env.physics
+    low = -physics.extent(torch.tensor((0.0, 0.0, -1.0)))[0]
+    feet = [bout.body.link_index(f"{side}_{foot}") for side in "LR" for foot in ("Ankle", "Toe")]
+    assert low[:, feet].sub(0.005).abs().max() < 0.002
+    ahead = bout.env.view.heading.local(physics.body_rot[:, :, 0, :, 0])
+    assert torch.allclose(ahead, torch.tensor((1.0, 0.0, 0.0)).expand(1, 2, 3), atol=1e-6)
+    assert physics.body_pos[0, :, 0, 0].tolist() == [-1.5, 1.5]
+
+
+def test_action_zero_holds_the_guard(task):
+    """10 s on their feet, also from starts with noise: nobody falls or leaves."""
+    env = make_env(task, num_worlds=3, seed=2)
+    env.age.zero_()
+    start = env.physics.body_pos.clone()
+    action = torch.zeros(3, 2, 69)
+    for i in range(299):
+        result = env.step(action)
+        assert not result.ended.any(), i
+        if i == 59:  # 2 s
+            moved = (env.physics.body_pos - start).norm(dim=-1)
+            assert moved[:, :, 0].max() < 0.05 and moved.max() < 0.15
+
+
+def test_features_have_the_names_and_sizes_of_the_page(task):
+    env = make_env(task, num_worlds=1)
+    sizes = {name: s.stop - s.start for name, s in env.obs_slices.items() if "goal" in name}
+    expected = {
+        "goal/opponent_pos": 3,
+        "goal/opponent_rot": 6,
+        "goal/opponent_linvel": 3,
+        "goal/opponent_body_pos": 72,
+        "goal/opponent_body_linvel": 72,
+        "goal/targets": 15 if task == "fencing" else 30,
+        "goal/own_force": 24,
+        "goal/opponent_force": 24,
+    } | ({"goal/bounds": 4} if task == "fencing" else {})
+    assert list(sizes.items()) == list(expected.items())
+    assert sum(sizes.values()) == {"fencing": 223, "boxing": 234}[task]
+    assert env.obs_size == 358 + sum(sizes.values())
+
+
+def test_the_opponent_as_seen(task):
+    """3 m ahead, turned by 180 degrees; its own left is the athlete's right."""
+    bout = Bout(task)
+    bout.move(0, 1.0, 0.5, 0.0)
+    bout.move(1, -2.0, 0.25, 0.1)
+    bout.begin()
+    seen = {name: value[0] for name, value in bout.features().items()}
+    head, foot = (bout.body.link_index(name) for name in ("Head", "L_Ankle"))
+    pos = bout.env.physics.body_pos[0]
+    views = (  # opponent's velocity, the same relative to the own, half a turn or none
+        (0, (-2, 0.25, 0.1), (-3, -0.25, 0.1), 1),
+        (1, (-1, -0.5, 0), (-3, -0.25, -0.1), -1),
+    )
+    for agent, velocity, relative, sign in views:
+        assert seen["opponent_pos"][agent].tolist() == pytest.approx((3, 0, 0), abs=1e-5)
+        assert seen["opponent_rot"][agent].tolist() == pytest.approx((-1, 0, 0, 0, -1, 0), abs=1e-5)
+        assert seen["opponent_linvel"][agent].tolist() == pytest.approx(velocity, abs=1e-5)
+        linvel = seen["opponent_body_linvel"][agent].view(24, 3)[head]
+        assert linvel.tolist() == pytest.approx(relative, abs=1e-5)
+        x, y, z = (pos[1 - agent, foot] - pos[agent, 0]).tolist()
+        place = seen["opponent_body_pos"][agent].view(24, 3)[foot]
+        assert place.tolist() == pytest.approx((sign * x, sign * y, z), abs=1e-5)
+
+
+def test_forces_are_shown_in_body_weights(task):
+    bout = Bout(task)
+    bout.begin()
+    weight, chest = bout.body.mass * 9.81, bout.body.link_index("Chest")
+    bout.env.physics.link_force[:, 1, chest] = torch.tensor((0.6, 0.0, -0.8)) * 2.0 * weight
+    bout.env.physics.link_force[:, 0, 3, 1] = 50.0 * weight
+    seen = bout.features()
+    assert seen["own_force"][0, 1, chest] == pytest.approx(4.0, rel=1e-5)
+    assert seen["opponent_force"][0, 0, chest] == pytest.approx(4.0, rel=1e-5)
+    assert seen["own_force"][0, 0, 3] == seen["opponent_force"][0, 1, 3] == 100.0
+    assert float(seen["own_force"].sum()) == pytest.approx(104.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 90, 180])
+def test_facing_falls_with_the_angle(task, degrees):
+    """Turning the back, or lying with the head elsewhere, is paid little."""
+    bout = Bout(task)
+    bout.place(0, -1.0, yaw=math.radians(degrees))
+    bout.begin()
+    facing = bout.step().terms["facing"][0]
+    expected = 0.1 * math.exp(-2 * (1 - math.cos(math.radians(degrees))))
+    assert facing.tolist() == pytest.approx([expected, 0.1], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "expected"),
+    [
+        ((-0.1, 0), 0.0),
+        ((0.0, 0), 0.0),
+        ((0.5, 0), 0.1 * math.exp(-1.0)),
+        ((1.0, 0), 0.1),
+        ((3.0, 0), 0.1),
+        ((0.0, 2.0), 0.0),
+        ((-1e-3, 2.0), 0.0),
+    ],
+)
+def test_only_the_way_towards_the_opponent_is_paid(task, velocity, expected):
+    """Walking round the opponent, or away from it, is not."""
+    bout = Bout(task)
+    bout.move(0, *velocity, 0.0)
+    bout.begin()
+    term = bout.step().terms["velocity"][0]
+    assert term.tolist() == pytest.approx([expected, 0.0], abs=1e-6)
+
+
+def test_the_way_is_that_to_the_opponent_wherever_one_looks(task):
+    bout = Bout(task)
+    bout.place(0, 0.0, 0.0, yaw=2.0)
+    bout.place(1, 0.6, 0.8, yaw=0.3)
+    bout.move(0, 0.6 * 0.7, 0.8 * 0.7, 0.5)
+    bout.begin()
+    assert bout.step().terms["velocity"][0, 0] == pytest.approx(0.1 * math.exp(-4 * 0.09), abs=1e-6)
+
+
+@pytest.mark.parametrize(("distance", "target"), [(0.0, "Chest"), (0.2, "Head"), (0.5, "Pelvis")])
+def test_strike_is_paid_by_the_nearest_target(task, distance, target):
+    """The targets' origins lie apart, so the distance to the one that is aimed at is the least only
+    where it is small; else the nearest is found by hand."""
+    bout = Bout(task)
+    bout.reach_out(distance, target)
+    bout.begin()
+    origins = bout.body.zero_pose_origins()
+    aim = origins[bout.body.link_index(target)]
+    others = [origins[bout.body.link_index(name)] - aim for name in combat.TARGETS]
+    least = min(float(np.linalg.norm(np.add((distance, 0, 0), v))) for v in others)
+    strike = bout.step().terms["strike"][0, 0]
+    assert strike == pytest.approx(0.6 * math.exp(-10 * least**2), abs=2e-5)
+
+
+@pytest.mark.parametrize(("newtons", "counts"), [(49.0, 0.0), (51.0, 1.0)])
+def test_a_touch_needs_50_newtons(task, newtons, counts):
+    bout = Bout(task)
+    bout.reach_out(0.2)
+    bout.begin()
+    step = bout.step((0, newtons))
+    assert step.terms["point"][0].tolist() == [counts, -counts]
+    assert step.metrics["touches_for"][0] == counts and step.metrics["touches_against"][0] == 0.0
+
+
+@pytest.mark.parametrize(("distance", "counts"), [(0.315, 1.0), (0.318, 0.0)])
+def test_a_touch_needs_the_point_near_the_target(task, distance, counts):
+    bout = Bout(task)
+    bout.reach_out(distance)
+    bout.begin()
+    assert bout.step((0, 500.0)).terms["point"][0].tolist() == [counts, -counts]
+    # Near the chest is not near the pelvis.
+    bout.begin()
+    assert bout.step((0, 500.0, "Pelvis")).terms["point"][0, 0] == 0.0
+
+
+def test_a_blow_that_is_off_again_counts(task):
+    """The force is that of any substep: near at either end of the step will do."""
+    bout = Bout(task)
+    bout.reach_out(0.3)
+    bout.begin()
+    bout.reach_out(0.5)
+    assert bout.step((0, 500.0)).terms["point"][0, 0] == 1.0
+    assert bout.step((0, 500.0)).terms["point"][0, 0] == 0.0
+
+
+@pytest.mark.parametrize("target", combat.TARGETS)
+def test_every_target_counts_for_both(task, target):
+    """Also where both touch in one step: then nobody gains."""
+    for agents in ((0,), (1,), (0, 1)):
+        bout = Bout(task)
+        bout.begin()
+        bout.env.memory["squares"].zero_()  # near before the step
+        point = bout.step(*((agent, 80.0, target) for agent in agents)).terms["point"][0]
+        expected = [float(0 in agents) - float(1 in agents)]
+        assert point.tolist() == [expected[0], -expected[0]]
+        assert bout.env.memory["touches"][0].tolist() == [float(a in agents) for a in range(2)]
+
+
+@pytest.mark.parametrize(("free", "counts"), [(12, 0.0), (14, 0.0), (15, 1.0), (18, 1.0)])
+def test_the_next_point_needs_half_a_second_without_contact(task, free, counts):
+    """0.4 s and 0.47 s are too short, 0.5 s and 0.6 s are not."""
+    bout = Bout(task)
+    bout.reach_out(0.2)
+    bout.begin()
+    assert bout.step((0, 200.0)).terms["point"][0, 0] == 1.0
+    for _ in range(free):
+        assert bout.step().terms["point"][0, 0] == 0.0
+    assert bout.step((0, 200.0)).terms["point"][0, 0] == counts
+
+
+def test_pushing_scores_once(task):
+    """Two seconds of contact, with breaks that are too short, and then touched lightly: one point.
+    A light touch before the first point does no harm."""
+    bout = Bout(task)
+    bout.reach_out(0.2)
+    bout.begin()
+    points = [float(bout.step((0, 30.0)).terms["point"][0, 0])]
+    for i in range(60):
+        hits = [(0, 300.0)] if i % 10 < 6 else []
+        points.append(float(bout.step(*hits).terms["point"][0, 0]))
+    for _ in range(20):
+        points.append(float(bout.step((0, 5.0)).terms["point"][0, 0]))
+    points.append(float(bout.step((0, 300.0)).terms["point"][0, 0]))
+    assert points[:2] == [0.0, 1.0] and sum(points) == 1.0
+
+
+def test_each_athlete_has_its_own_half_second(task):
+    bout = Bout(task)
+    bout.begin()
+    bout.env.memory["squares"].zero_()
+    assert bout.step((0, 100.0)).terms["point"][0].tolist() == [1.0, -1.0]
+    bout.env.memory["squares"].zero_()
+    assert bout.step((1, 100.0)).terms["point"][0].tolist() == [-1.0, 1.0]
+
+
+def test_only_weapons_on_the_opponent_are_asked_about(task):
+    """Neither feet nor the own body nor a blade's side can score: no pair names them."""
+    scene = make_scene(task)
+    weapons = {"fencing": ["R_Hand:1"], "boxing": ["L_Hand", "R_Hand"]}[task]
+    expected = {
+        (f"agent{a}/{weapon}", f"agent{1 - a}/{target}")
+        for a in range(2)
+        for weapon in weapons
+        for target in ("Pelvis", "Torso", "Spine", "Chest", "Head")
+    }
+    assert set(scene.contact_pairs) == expected
+    assert len(scene.contact_pairs) == len(expected) == (10 if task == "fencing" else 20)
+
+
+@pytest.mark.parametrize("agent", [0, 1])
+def test_who_falls_has_lost_and_the_other_is_cut_off(task, agent):
+    """Whoever leads gains nothing by lying down."""
+    bout = Bout(task)
+    bout.begin()
+    bout.env.memory["touches"][:, agent] = 3.0
+    standing = bout.step(ground={(agent, "L_Hand"): 49.0, (agent, "L_Toe"): 900.0})
+    assert not standing.terminated.any()
+    assert standing.metrics["success"][0] == float(agent == 0)
+    assert standing.metrics["draw"][0] == 0.0
+    step = bout.step(ground={(agent, "L_Hand"): 51.0})
+    assert step.terminated[0].tolist() == [agent == 0, agent == 1]
+    assert step.metrics["success"][0] == float(agent == 1) == float(step.success[0])
+    assert step.metrics["fell"][0] == float(agent == 0)
+    assert step.metrics["opponent_fell"][0] == float(agent == 1)
+
+
+def test_the_environment_cuts_the_other_off(task):
+    env = make_env(task, num_worlds=2, training=False)
+    action = torch.zeros(2, 2, 69)
+    env.step(action)
+    qpos, q = env.physics.qpos.clone(), env.physics.scene.agent_qpos(1)
+    qpos[1, q.start + 2] = 0.1
+    env.physics.move(torch.tensor([False, True]), qpos, env.physics.qvel.clone())
+    result = env.step(action)
+    assert result.terminated.tolist() == [[False, False], [False, True]]
+    assert result.truncated.tolist() == [[False, False], [True, False]]
+    assert result.metrics["success"].tolist() == [0.0, 1.0]
+
+
+def test_more_touches_win_and_as_many_are_a_draw(task):
+    bout = Bout(task, num_worlds=4)
+    bout.begin()
+    bout.env.memory["touches"][:] = torch.tensor([[2.0, 1.0], [1.0, 1.0], [0.0, 1.0], [2.0, 1.0]])
+    bout.show()
+    bout.env.physics.ground_force[3, :, 0, 2] = 500.0  # both fall: the touches decide
+    bout.env.view.clock += 1
+    step = bout.env.task.advance(bout.env.view, bout.env.memory)
+    assert step.metrics["success"].tolist() == [1.0, 0.0, 0.0, 1.0]
+    assert step.metrics["draw"].tolist() == [0.0, 1.0, 0.0, 0.0]
+    assert step.terminated.tolist() == [[False, False]] * 3 + [[True, True]]
+
+
+def test_half_a_turn_with_the_athletes_exchanged_changes_nothing(task):
+    """Observations and rewards of states of all kinds, with contacts made up."""
+    env = make_env(task, num_worlds=16, training=False)
+    scene, physics = env.physics.scene, env.physics
+    state, everyone = scattered(env, 5), torch.ones(16, dtype=torch.bool)
+    state.qpos[3, 2] = 0.2  # has fallen
+    qpos, qvel = swapped(state.qpos, state.qvel, scene)
+    generator = torch.Generator().manual_seed(1)
+    forces = 100.0 * torch.rand(16, 2, len(scene.contact_pairs) // 2, generator=generator)
+    forces = forces * (torch.rand(forces.shape, generator=generator) < 0.2)
+    felt = 500.0 * torch.randn(16, 2, 24, 3, generator=generator)
+    half = torch.tensor((-1.0, -1.0, 1.0))
+    results = []
+    for turn, (q, v) in enumerate(((state.qpos, state.qvel), (qpos, qvel))):
+        physics.reset(everyone, PhysicsState(q, v, state.mocap_pos))
+        env.view.refresh()
+        env.memory = env.task.begin(env.view, {})
+        env.memory["squares"][:8] = 0.0  # every contact is near enough
+        physics.pair_force[:] = (forces.flip(1) if turn else forces).flatten(1)
+        physics.link_force[:] = felt.flip(1) * half if turn else felt
+        env.view.clock = torch.full((16,), 5)
+        step = env.task.advance(env.view, env.memory)
+        results.append((env._observe(), step.terms, step.terminated))
+    (obs, terms, terminated), (other_obs, other_terms, other_terminated) = results
+    assert (obs - other_obs.flip(1)).abs().max() < 1e-5
+    for name, term in terms.items():
+        assert (term - other_terms[name].flip(1)).abs().max() < 1e-5, name
+    assert torch.equal(terminated, other_terminated.flip(1)) and terminated.any()
+    assert terms["point"].abs().sum() > 0 and terms["velocity"].max() > 0.01
+
+
+def test_random_play_stays_within_bounds(task):
+    """What one gains the other loses; the other terms are between 0 and their weights."""
+    env = make_env(task, num_worlds=16, seed=1)
+    generator = torch.Generator().manual_seed(4)
+    largest = 0.0
+    for _ in range(80):
+        result = env.step(0.15 * torch.randn(16, 2, 69, generator=generator))
+        for name, weight in (("facing", 0.1), ("velocity", 0.1), ("strike", 0.6)):
+            term = result.terms[name]
+            assert float(term.min()) >= 0.0 and float(term.max()) <= weight + 1e-6
+        assert (result.terms["point"].sum(1) == 0).all()
+        largest = max(largest, float(result.obs.abs().max()))
+    assert largest < 200.0 and env.physics.nan_worlds == 0
+
+
+def test_mujoco_and_warp_stand_on_guard_together(task):
+    """1 s under PD: |dqpos| < 1e-5, and the same tensors."""
+    pytest.importorskip("mujoco_warp")
+    scene = make_scene(task)
+    c = make_physics("mujoco", scene, 2, threads=1)
+    w = make_physics("warp", scene, 2, device="cpu")
+    state, both = default_state(scene, 2, "cpu"), torch.tensor([True, True])
+    ctrl = state.qpos[:, [i for a in range(2) for i in range(76 * a + 7, 76 * a + 76)]]
+    worst = 0.0
+    for physics in (c, w):
+        physics.reset(both, state)
+    for _ in range(30):
+        c.step(ctrl)
+        w.step(ctrl)
+        worst = max(worst, float((c.qpos - w.qpos).abs().max()))
+    print(f"{task}: mujoco against warp, 1 s on guard: |dqpos| = {worst:.1e}")
+    assert worst < 1e-5
+    assert (c.body_linvel - w.body_linvel).abs().max() < 1e-3
+    assert (c.ground_force - w.ground_force).abs().max() < 0.5
+    assert int(w.overflow) == 0 and int(w.nan_worlds) == 0
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp", "drake"])
+def test_a_blow_scores_once(task, engine):
+    """The opponent's chest just beyond the weapon of an athlete that comes on at 1.5 m/s, on every
+    engine; then the weapon is pushed on."""
+    pytest.importorskip({"mujoco": "mujoco", "warp": "mujoco_warp", "drake": "pydrake"}[engine])
+    bout = Bout(task, engine=engine)
+    bout.reach_out(0.12 if task == "fencing" else 0.2)
+    bout.move(0, 1.5, 0.0, 0.0)
+    bout.begin()
+    results = list(bout.play(8))
+    assert sum(float(r.terms["point"][0, 0]) for r in results) == 1.0
+    assert results[-1].metrics["touches_against"][0] == 0.0
