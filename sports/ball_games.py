@@ -29,7 +29,9 @@ from sports.task import (
 BALL_TOP_SPEED = 30.0
 """m/s, at which ``toward`` is 1"""
 GET_UP_SECONDS = 1.0
-"""After so long on the ground an athlete is put back on its feet."""
+"""So long after its fall an athlete is put back on its feet."""
+UPRIGHT = 0.7
+"""Height (m) of the root at which an athlete that fell has got up by itself."""
 BODY_CLEARANCE, BALL_CLEARANCE = 1.8, 0.6
 """Distances (m) from other athletes, arms stretched out, and from the ball that it needs there."""
 FOUL_SECONDS = 1.0
@@ -174,7 +176,7 @@ def get_up(
     near. If all are taken, where it lies. One athlete of a world at a time: the next one's turn is
     a control step later.
 
-    ``down`` (N, A) steps on the ground. Returns the move, ``down`` with 0 for who got up, and
+    ``down`` (N, A) steps since the fall of who has not got up. Returns the move, ``down`` with 0 for who got up, and
     (N, A, 3) the roots after the move.
     """
     root, agents = view.root_pos, down.shape[1]

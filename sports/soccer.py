@@ -24,7 +24,7 @@ from sports import ball_games
 from sports.humanoid.body import Body, Shape
 from sports.physics.base import PhysicsState
 from sports.scene import Scene, SceneObject, Start
-from sports.task import Advance, Memory, Task, View, clamp01, constant, length, nan_where
+from sports.task import Advance, Memory, Task, View, clamp01, constant, length
 
 HALF_LENGTH, HALF_WIDTH = 16.0, 10.0
 GOAL_HALF_WIDTH, GOAL_HEIGHT = 2.0, 2.0
@@ -82,8 +82,9 @@ def football(pos: tuple[float, float, float]) -> SceneObject:
 
 
 def goal_frame(name: str, side: float) -> SceneObject:
-    """Posts and crossbar, to be seen: behind the goal plane, where a ball is in or out already."""
-    x, radius = side * (HALF_LENGTH + 0.4), 0.06
+    """The frame that holds the net: so far behind the goal plane that a ball at 30 m/s which would
+    rebound from it has been seen behind the plane before."""
+    x, radius = side * (HALF_LENGTH + 1.2), 0.06
     y, z = GOAL_HALF_WIDTH + radius, GOAL_HEIGHT + radius
     return SceneObject(
         name=name,
@@ -114,8 +115,8 @@ def touches(view: View) -> tuple[Tensor, Tensor]:
 
 
 def goal_posts(view: View, side: Tensor) -> Tensor:
-    """(N, A, 4) feet of the posts of the goals at x = 16 ``side`` (A,), as seen from the root: right
-    and left post for who looks into the goal, x and y each (m). The bar is always 2 m high."""
+    """(N, A, 4) feet of the posts of the goals at x = 16 ``side`` (A,), seen from the root: of who
+    looks into the goal the right one, then the left one, x and y each (m). The bar is 2 m high."""
     right = constant((HALF_LENGTH, -GOAL_HALF_WIDTH, 0.0), side.device)
     left = constant((HALF_LENGTH, GOAL_HALF_WIDTH, 0.0), side.device)
     posts = side[:, None, None] * torch.stack((right, left))  # (A, 2, 3)
@@ -245,7 +246,8 @@ def advance(view: View, memory: Memory) -> Advance:
 
     # Rewards: to the ball, and at the ball to the other goal.
     to_ball = length(root - ball[:, None])
-    aim = goes[:, None] * constant((HALF_LENGTH, 0.0, GOAL_HEIGHT / 2), ball.device)  # (A, 3)
+    far, high = (HALF_LENGTH, 0.0, 0.0), (0.0, 0.0, GOAL_HEIGHT / 2)
+    aim = goes[:, None] * constant(far, ball.device) + constant(high, ball.device)  # (A, 3)
     gained = length(before[:, None] - aim) - length(ball[:, None] - aim)
     aside = root[..., :2] - ball[:, None, :2]
     plays = aside.square().sum(-1) < PLAYING_DISTANCE**2
@@ -260,8 +262,10 @@ def advance(view: View, memory: Memory) -> Advance:
 
     # Who lies too long is put on its feet, a ball over a wall is dropped inside.
     fallen = view.fallen()
-    falls = memory["falls"] + (fallen & (memory["down"] == 0))
-    down = (memory["down"] + 1.0) * fallen
+    fell_before = memory["down"] > 0
+    falls = memory["falls"] + (fallen & ~fell_before)
+    lies = fallen | (fell_before & (root[..., 2] < ball_games.UPRIGHT))
+    down = (memory["down"] + 1.0) * lies
     edge = HALF_LENGTH - 1.0, HALF_WIDTH - 1.0
     move, down, root_after = ball_games.get_up(view, down, *edge)
     x, y, z = ball.unbind(-1)

@@ -114,7 +114,10 @@ class DrakePhysics:
         self._free: list[_Object] = []
         self._fixtures: list[_Object] = []
         for obj in scene.objects:
-            added = _add_object(plant, obj, self.timestep, points, shapes)
+            losses = OBJECT_DISSIPATION
+            if scene.bouncing and obj.motion != "free":
+                losses = 0.0  # a wall must leave a ball the restitution that it has
+            added = _add_object(plant, obj, self.timestep, losses, points, shapes)
             (self._fixtures if added.frame is not None else self._free).append(added)
         plant.Finalize()
         filter_collisions(scene_graph, self._humanoids, [ground], points, shapes)
@@ -461,6 +464,7 @@ def _add_object(
     plant: MultibodyPlant,
     obj: SceneObject,
     timestep: float,
+    dissipation: float,
     points: list[GeometryId],
     shapes: list[GeometryId],
 ) -> _Object:
@@ -488,7 +492,7 @@ def _add_object(
             rigid,
             obj.name,
             obj.shapes,
-            contact_properties(obj.friction, OBJECT_STIFFNESS, OBJECT_DISSIPATION),
+            contact_properties(obj.friction, OBJECT_STIFFNESS, dissipation),
             ground=obj.motion == "free" and obj.meets_ground,
         )
     points.extend(own[0])

@@ -1,0 +1,524 @@
+"""The rules of one against one and two against two on states made by hand, and who sees what."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from sports import quaternion
+from sports.env import make_env
+from sports.physics import PhysicsState, default_state, make_physics
+from tests.sports.pitch import Pitch, seen_from, total
+
+STANDING = 0.9412
+TASKS = ("soccer_1v1", "soccer_2v2")
+
+
+def match(task="soccer_1v1", ball=(0.0, 0.0, 0.11), vel=(0.0, 0.0, 0.0), **options) -> Pitch:
+    pitch = Pitch(task, **options)
+    pitch.ball(ball, vel)
+    pitch.begin()
+    return pitch
+
+
+def pos(pitch: Pitch, step, thing: int | str) -> torch.Tensor:
+    """Where a move puts an athlete's root or the ball, world 0."""
+    scene = pitch.scene
+    at = scene.object_qpos("ball") if thing == "ball" else scene.agent_qpos(int(thing))
+    return step.move.qpos[0, at][:7]
+
+
+# Starts.
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_kick_off(task):
+    env = make_env(task, num_worlds=3, training=False)
+    places = [(-3.0, 0.0), (3.0, 0.0)]
+    if task == "soccer_2v2":
+        places = [(-3.0, 0.0), (-8.0, -3.0), (3.0, 0.0), (8.0, 3.0)]
+    root = env.physics.body_pos[:, :, 0, :2]
+    assert (root - torch.tensor(places)).abs().max() < 1e-6
+    ahead = env.physics.body_rot[:, :, 0, 0, 0]  # everybody faces the other half
+    assert (ahead + torch.tensor(places)[:, 0].sign()).abs().max() < 1e-6
+    assert (env.physics.object_pos - torch.tensor((0.0, 0.0, 0.11))).abs().max() < 1e-6
+    assert env.max_steps == 3000 and env.reward_scale == 3.0
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_starts_anywhere_are_on_the_field_and_apart(task):
+    env = make_env(task, num_worlds=300, seed=4, options={"uniform": 1.0})
+    things = torch.cat((env.physics.body_pos[:, :, 0], env.physics.object_pos), 1)[..., :2]
+    assert (things[..., 0].abs() <= 13.0).all() and (things[..., 1].abs() <= 8.0).all()
+    assert things[..., 0].abs().max() > 12.5 and things[..., 1].abs().max() > 7.5
+    gaps = torch.cdist(things, things) + 99.0 * torch.eye(things.shape[1])
+    assert 2.0 - 1e-3 <= gaps.min() < 2.3
+    heading = env.view.heading
+    yaw = torch.atan2(heading.sin, heading.cos)
+    assert yaw.min() < -3.0 and yaw.max() > 3.0
+    half = make_env(task, num_worlds=300, seed=4)  # half of them kick off
+    kick_off = (half.physics.object_pos[:, 0, :2].norm(dim=-1) < 1e-6).float().mean()
+    assert 0.4 < kick_off < 0.6
+    with pytest.raises(ValueError, match="share of uniform starts"):
+        make_env(task, num_worlds=1, options={"uniform": 1.5})
+
+
+# Who sees what.
+
+
+def test_everybody_sees_ball_goals_mates_and_opponents():
+    pitch = match("soccer_2v2")
+    places = [(-3.0, 1.0, 0.4), (-8.0, -3.0, -1.0), (3.0, 2.0, 2.5), (8.0, 3.0, 3.0)]
+    for agent, (x, y, yaw) in enumerate(places):
+        pitch.stand(agent, x, y, yaw)
+        pitch.state.qvel[:, pitch.scene.agent_qvel(agent).start] = 1.0 + agent
+    pitch.ball((2.0, -4.0, 0.5), (3.0, 1.0, -2.0))
+    got = pitch.features()
+    roots = [(x, y, STANDING) for x, y, _ in places]
+    for viewer, mate, near, far in ((0, 1, 2, 3), (1, 0, 3, 2), (2, 3, 0, 1), (3, 2, 1, 0)):
+        root, yaw = roots[viewer], places[viewer][2]
+        side = 1.0 if viewer < 2 else -1.0
+
+        def local(v, yaw=yaw):
+            return seen_from(v, (0, 0, 0), yaw)
+
+        def posts(side, root=root, yaw=yaw):
+            right = seen_from((16 * side, -2 * side, 0), root, yaw)[:2]
+            return right + seen_from((16 * side, 2 * side, 0), root, yaw)[:2]
+
+        want = {
+            "ball_position": seen_from((2.0, -4.0, 0.5), root, yaw),
+            "ball_rotation": local((1, 0, 0)) + local((0, 1, 0)),
+            "ball_velocity": local((3.0, 1.0, -2.0)) + [0.0] * 3,
+            "own_goal": posts(-side),
+            "other_goal": posts(side),
+        }
+        for name, other in (("mate1", mate), ("opponent1", near), ("opponent2", far)):
+            c, s = math.cos(places[other][2]), math.sin(places[other][2])
+            want[f"{name}_position"] = seen_from(roots[other], root, yaw)
+            want[f"{name}_rotation"] = local((c, s, 0)) + local((-s, c, 0))
+            want[f"{name}_velocity"] = local((1.0 + other, 0, 0)) + [0.0] * 3
+        assert list(got) == list(want)
+        for name, values in want.items():
+            assert got[name][0, viewer].tolist() == pytest.approx(values, abs=2e-3), (viewer, name)
+
+
+def turned(state: PhysicsState, scene) -> PhysicsState:
+    """The field turned by 180 degrees about z, the teams exchanged."""
+    out, size = state.clone(), scene.num_agents // 2
+    half_turn = torch.tensor((0.0, 0.0, 0.0, 1.0))
+    pairs = [(scene.agent_qpos(a), scene.agent_qpos((a + size) % (2 * size))) for a in range(2 * size)]
+    speeds = [(scene.agent_qvel(a), scene.agent_qvel((a + size) % (2 * size))) for a in range(2 * size)]
+    pairs.append((scene.object_qpos("ball"),) * 2)
+    speeds.append((scene.object_qvel("ball"),) * 2)
+    for source, target in pairs:
+        rows = state.qpos[:, source].clone()
+        rows[:, :2] *= -1.0
+        rows[:, 3:7] = quaternion.multiply(half_turn.expand(len(rows), 4), rows[:, 3:7])
+        out.qpos[:, target] = rows
+    for source, target in speeds:
+        rows = state.qvel[:, source].clone()
+        rows[:, :2] *= -1.0  # the angular velocity is in the body's own frame
+        out.qvel[:, target] = rows
+    return out
+
+
+def scattered(scene, places: torch.Tensor, seed: int) -> PhysicsState:
+    """Athletes in any attitude and motion about a ball at (n, 3), some lying, some beside it."""
+    n = len(places)
+    generator = torch.Generator().manual_seed(seed)
+
+    def noise(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    state = default_state(scene, n, "cpu")
+    state.qvel = noise(n, scene.nv)
+    ball = scene.object_qpos("ball")
+    state.qpos[:, ball.start : ball.start + 3] = places
+    state.qvel[:, scene.object_qvel("ball")] *= 6.0
+    for a in range(scene.num_agents):
+        rows = state.qpos[:, scene.agent_qpos(a)]
+        rows[:, :2] = places[:, :2] + 0.7 * noise(n, 2)
+        rows[:, 2] = 0.5 + noise(n).abs()
+        rows[:, 3:7] = torch.nn.functional.normalize(noise(n, 4), dim=-1)
+        rows[:, 7:] = 0.3 * noise(n, 69)
+    return state
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_turned_field_with_exchanged_sides_is_the_same_game(task):
+    n = 24
+    envs = [make_env(task, num_worlds=n, training=False) for _ in range(2)]
+    scene = envs[0].physics.scene
+    size = scene.num_agents // 2
+    swap = [(a + size) % (2 * size) for a in range(2 * size)]
+    generator = torch.Generator().manual_seed(3)
+    before = torch.randn(n, 3, generator=generator) * torch.tensor((9.0, 6.0, 0.1))
+    before[:, 2] = before[:, 2].abs() + 0.11
+    after = before + 0.2 * torch.randn(n, 3, generator=generator)
+    before[0], after[0] = torch.tensor((15.8, 1.0, 0.5)), torch.tensor((16.4, 1.1, 0.5))
+    states = [scattered(scene, places, seed) for seed, places in ((1, before), (2, after))]
+    ball = scene.object_qpos("ball")
+    steps, features = [], []
+    order = [scene.contact_pairs.index(p) for p in swapped_pairs(scene)]
+    touch = torch.rand(n, len(order), generator=torch.Generator().manual_seed(5)) < 0.05
+    touch[0] = False
+    for k, env in enumerate(envs):
+        first, second = (turned(s, scene) if k else s for s in states)
+        everyone = torch.ones(n, dtype=torch.bool)
+        env.physics.reset(everyone, first)
+        env.view.refresh()
+        env.memory = env.task.begin(env.view, {})
+        # Of two that lie equally long the first is helped up first: here none do.
+        for agent in range(2 * size):
+            env.memory["down"][:, swap[agent] if k else agent] = 40.0 + agent
+        env.physics.reset(everyone, second)
+        env.view.clock = env.view.clock + 5
+        env.view.refresh()
+        env.physics.pair_force[:] = (touch[:, order] if k else touch).float()
+        steps.append(env.task.advance(env.view, env.memory))
+        features.append(env.task.features(env.view, env.memory))
+    a, b = steps
+    assert a.terms["goal"][0].tolist() == [10.0] * size + [-10.0] * size
+    assert all(float(v.abs().max()) > 0 for v in a.terms.values())
+    for name, value in features[0].items():
+        torch.testing.assert_close(value[:, swap], features[1][name], rtol=0, atol=1e-5)
+    for name, value in a.terms.items():
+        torch.testing.assert_close(value[:, swap], b.terms[name], rtol=0, atol=1e-5, msg=name)
+    assert torch.equal(a.terminated[:, swap], b.terminated)
+    assert torch.equal(a.metrics["goals_for"], b.metrics["goals_against"])
+    # What moves, moves to the same places.
+    assert torch.equal(a.move.mask, b.move.mask)
+    assert a.move.mask.sum() > n / 3, a.move.mask
+    moved = turned(PhysicsState(a.move.qpos, a.move.qvel, states[1].mocap_pos), scene)
+    rows = a.move.mask
+    for q in [scene.agent_qpos(i).start for i in range(2 * size)] + [ball.start]:
+        here, there = moved.qpos[rows, q : q + 3], b.move.qpos[rows, q : q + 3]
+        torch.testing.assert_close(here, there, rtol=0, atol=1e-4)
+
+
+def swapped_pairs(scene):
+    size = scene.num_agents // 2
+    for side, ball in scene.contact_pairs:
+        agent, _, link = side.partition("/")
+        other = f"agent{(int(agent[5:]) + size) % (2 * size)}"
+        yield (f"{other}/{link}" if link else other, ball)
+
+
+# Rewards and goals.
+
+
+@pytest.mark.parametrize(("x", "plays"), [(0.49, True), (0.51, False)])
+def test_who_plays_the_ball_is_paid_for_bringing_it_on(x, plays):
+    pitch = match(ball=(0.0, 0.0, 0.11))
+    for agent, side in ((0, -1.0), (1, 1.0)):
+        pitch.stand(agent, 0.2 + side * x, 0.0, 0.0 if agent == 0 else math.pi)
+    pitch.ball((0.2, 0.0, 0.11), (6.0, 2.0, 0.0))
+    step = pitch.advance()
+    for agent, goal in ((0, (16.0, 0.0, 1.0)), (1, (-16.0, 0.0, 1.0))):
+        gained = math.dist((0.0, 0.0, 0.11), goal) - math.dist((0.2, 0.0, 0.11), goal)
+        way = [g - b for g, b in zip(goal, (0.2, 0.0, 0.11))]
+        speed = max(6.0 * way[0] / math.hypot(*way) / 30.0, 0.0)
+        start = 3.0
+        before = math.hypot(start, STANDING - 0.11)
+        now = math.hypot(x, STANDING - 0.11)
+        want = {
+            "approach": 0.05 * min(before - now, 1.0),
+            "dribble": 0.2 * gained * plays,
+            "shot": 0.3 * speed * plays,
+            "goal": 0.0,
+        }
+        for name, value in want.items():
+            assert step.terms[name][0, agent] == pytest.approx(value, abs=1e-4), (agent, name)
+
+
+def test_stepping_back_from_the_ball_costs_nothing():
+    pitch = match()
+    pitch.stand(0, -4.0, 0.0)
+    assert pitch.advance().terms["approach"][0].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("at", "goal"), [((1.99, 0.5), 1), ((2.01, 0.5), 0), ((0.0, 1.99), 1), ((0.0, 2.01), 0)]
+)
+def test_a_goal_counts_at_either_end_for_those_who_attack_it(side, at, goal):
+    pitch = match("soccer_2v2", ball=(15.7 * side, *at))
+    pitch.ball((16.3 * side, *at), (18.0 * side, 0.0, 0.0))
+    step = pitch.advance()
+    points = [10.0 * goal * side] * 2 + [-10.0 * goal * side] * 2
+    assert step.terms["goal"][0].tolist() == points
+    assert step.terminated[0].tolist() == [bool(goal)] * 4
+    assert step.metrics["goals_for"][0] == float(goal and side > 0)
+    assert step.metrics["goals_against"][0] == float(goal and side < 0)
+    assert step.success[0] == bool(goal and side > 0)
+
+
+def test_a_ball_that_comes_back_out_of_the_plane_is_no_second_goal():
+    pitch = match(ball=(16.2, 0.0, 0.5))
+    pitch.ball((16.6, 0.0, 0.5))
+    assert not pitch.advance().terminated.any()
+
+
+@pytest.mark.parametrize(("steps", "void"), [(29, True), (30, False)])
+def test_a_goal_after_handling_is_void(steps, void):
+    pitch = match(ball=(15.0, 0.0, 0.5))
+    pitch.stand(0, 14.6, 0.0)
+    step = pitch.advance("agent0/L_Hand")
+    assert step.metrics["handling"][0] == 1.0
+    for _ in range(steps - 1):
+        pitch.advance()
+    pitch.ball((16.3, 0.0, 0.5), (20.0, 0.0, 0.0))
+    step = pitch.advance()
+    assert step.terminated.all()
+    assert step.terms["goal"][0].tolist() == ([0.0, 0.0] if void else [10.0, -10.0])
+    assert step.metrics["goals_for"][0] == float(not void)
+
+
+def test_handling_by_the_other_side_does_not_save_its_goal():
+    pitch = match(ball=(15.9, 0.0, 0.5))
+    pitch.ball((16.3, 0.0, 0.5), (20.0, 0.0, 0.0))
+    assert pitch.advance("agent1/R_Wrist").terms["goal"][0].tolist() == [10.0, -10.0]
+
+
+def test_handling_earns_nothing_for_a_second():
+    pitch = match()
+    pitch.stand(0, -0.3, 0.0)
+    pitch.advance("agent0/R_Hand")
+    earned = []
+    for k in range(31):
+        pitch.ball((0.01 * k, 0.0, 0.11), (6.0, 0.0, 0.0))
+        pitch.stand(0, -0.3 + 0.01 * k, 0.0)
+        earned.append(float(total(pitch.advance())[0, 0]) > 0)
+    assert earned == [False] * 29 + [True] * 2
+    # It was one touch; a foot is none.
+    assert pitch.advance("agent0/R_Toe").metrics["handling"][0] == 1.0
+    assert pitch.advance("agent0/R_Hand").metrics["handling"][0] == 2.0
+
+
+def test_possession_is_the_share_of_time_since_a_team_touched_it():
+    pitch = match()
+    assert pitch.advance().metrics["possession"].isnan().all()
+    pitch.advance("agent0")
+    pitch.advance()
+    pitch.advance("agent1")
+    step = pitch.advance("agent0", "agent1")  # contested: it stays theirs
+    assert step.metrics["possession"][0] == pytest.approx(2 / 4)
+    assert pitch.advance("agent0").metrics["possession"][0] == pytest.approx(3 / 5)
+
+
+# What is put elsewhere.
+
+
+def test_an_athlete_that_lies_is_put_on_its_feet_after_a_second():
+    pitch = match()
+    pitch.stand(1, 5.0, 1.0, 2.0, z=0.1)
+    for k in range(30):
+        step = pitch.advance(down=(1,))
+        assert bool(step.move.mask[0]) == (k == 29), k
+    root = pos(pitch, step, 1)
+    assert root[:3].tolist() == pytest.approx([5.0, 1.0, STANDING], abs=1e-3)
+    assert root[3:].tolist() == pytest.approx([math.cos(1.0), 0, 0, math.sin(1.0)], abs=1e-4)
+    speeds = step.move.qvel[0, pitch.scene.agent_qvel(1)]
+    joints = step.move.qpos[0, pitch.scene.agent_qpos(1)][7:]
+    assert speeds.abs().max() == 0.0 and joints.abs().max() == 0.0
+    # The other one and the ball stay; who stands does not wait to get up.
+    assert pos(pitch, step, 0)[:3].tolist() == pytest.approx([-3.0, 0.0, STANDING], abs=1e-3)
+    assert step.metrics["falls"][0] == 0.0  # those of team 0
+    # The way to the ball is measured anew from where it stands.
+    to_ball = math.dist((5.0, 1.0, STANDING), (0.0, 0.0, 0.11))
+    assert step.memory["to_ball"][0, 1] == pytest.approx(to_ball, abs=1e-3)
+    assert pitch.env.memory["down"][0].tolist() == [0.0, 0.0]
+
+
+def test_getting_up_by_itself_starts_the_clock_again():
+    pitch = match()
+    for _ in range(29):
+        pitch.advance(down=(0,))
+    assert not pitch.advance().move.mask.any()
+    step = pitch.advance(down=(0,))
+    assert not step.move.mask.any() and step.metrics["falls"][0] == 2.0
+
+
+def test_it_stands_up_where_nobody_is():
+    """An opponent at its side, then also the ball at the nearest place beside."""
+    for ball, moved in (((0.0, 5.0, 0.11), True), ((4.0 - 1.8, 0.0, 0.11), True)):
+        pitch = match(ball=ball)
+        pitch.stand(0, 4.0, 0.0, z=0.1)
+        pitch.stand(1, 4.8, 0.0)
+        pitch.env.memory["down"][:, 0] = 29.0
+        step = pitch.advance(down=(0,))
+        x, y = pos(pitch, step, 0)[:2].tolist()
+        assert (math.hypot(x - 4.0, y) == pytest.approx(1.8, abs=1e-3)) == moved
+        assert math.hypot(x - 4.8, y) >= 1.8 and math.hypot(x - ball[0], y - ball[1]) >= 0.6
+
+
+def test_it_stands_up_inside_the_field():
+    pitch = match()
+    pitch.stand(0, 15.9, 9.8, z=0.1)
+    pitch.env.memory["down"][:, 0] = 29.0
+    step = pitch.advance(down=(0,))
+    assert pos(pitch, step, 0)[:2].tolist() == pytest.approx([15.0, 9.0], abs=1e-4)
+
+
+def test_two_that_lie_get_up_one_after_the_other():
+    pitch = match("soccer_2v2")
+    for agent in (1, 3):
+        pitch.stand(agent, 6.0 + 0.2 * agent, 0.0, z=0.1)
+    pitch.env.memory["down"][:, 1] = 29.0
+    pitch.env.memory["down"][:, 3] = 29.0
+    first = pitch.advance(down=(1, 3))
+    assert first.memory["down"][0].tolist() == [0.0, 0.0, 0.0, 30.0]
+    pitch.state.qpos[:] = first.move.qpos
+    pitch.state.qvel[:] = first.move.qvel
+    second = pitch.advance(down=(3,))
+    assert second.memory["down"][0].tolist() == [0.0] * 4
+    places = [pos(pitch, second, a)[:2] for a in (1, 3)]
+    assert float((places[0] - places[1]).norm()) >= 1.79
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_a_fall_ends_the_episode_only_if_asked(ends):
+    pitch = match(terminate_on_fall=ends)
+    assert pitch.advance(down=(1,)).terminated[0].tolist() == [False, ends]
+
+
+@pytest.mark.parametrize(
+    ("ball", "inside"),
+    [
+        ((5.0, 10.3, 0.8), None),  # in front of the wall's middle, pressed into it
+        ((5.0, 10.3, 1.2), (5.0, 9.78)),  # over it
+        ((5.0, -10.6, 0.3), (5.0, -9.78)),  # behind it
+        ((16.6, 3.0, 0.3), (15.78, 3.0)),
+        ((-16.2, 0.0, 2.5), (-15.78, 0.0)),  # over the bar
+        ((15.9, 9.9, 3.0), None),
+    ],
+)
+def test_a_ball_over_a_wall_is_dropped_inside(ball, inside):
+    pitch = match(ball=ball)
+    pitch.ball(ball, (0.0, 3.0, 1.0))
+    step = pitch.advance()
+    assert not step.terminated.any()
+    assert bool(step.move.mask[0]) == (inside is not None)
+    if inside is not None:
+        assert pos(pitch, step, "ball")[:3].tolist() == pytest.approx([*inside, 2.0], abs=1e-4)
+        assert step.move.qvel[0, pitch.scene.object_qvel("ball")].abs().max() == 0.0
+        assert step.memory["ball"][0].tolist() == pytest.approx([*inside, 2.0], abs=1e-4)
+
+
+# The engines.
+
+
+@pytest.mark.parametrize("name", ["mujoco", "drake"])
+def test_walls_stop_shots_and_mouths_let_them_in(name):
+    """30 m/s at the long wall, at the goal line beside the mouth, and into the mouth at its edge."""
+    if name == "drake":
+        pytest.importorskip("pydrake")
+    scene = Pitch("soccer_1v1").scene
+    options = {"threads": 1} if name == "mujoco" else {}
+    physics = make_physics(name, scene, 3, **options)
+    state = default_state(scene, 3, "cpu")
+    q, v = scene.object_qpos("ball").start, scene.object_qvel("ball").start
+    pos = [(5.0, 8.0, 0.5), (14.0, 3.0, 0.5), (14.0, 1.98, 0.5)]
+    state.qpos[:, q : q + 3] = torch.tensor(pos)
+    state.qvel[:, v : v + 3] = torch.tensor([(0.0, 30.0, 0.0), (30.0, 0.0, 0.0), (30.0, 0.0, 0.0)])
+    physics.reset(torch.ones(3, dtype=torch.bool), state)
+    furthest = torch.zeros(3, 3)
+    for _ in range(5):
+        physics.step(torch.zeros(3, scene.nu))
+        furthest = torch.maximum(furthest, physics.object_pos[:, 0])
+        assert physics.object_linvel.norm(dim=-1).max() < 30.5
+    assert furthest[0, 1] < 10.4 and furthest[1, 0] < 16.4
+    speed = physics.object_linvel[:, 0]
+    assert -26.0 < speed[0, 1] < -20.0 and -26.0 < speed[1, 0] < -20.0
+    assert furthest[2, 0] > 17.0
+
+
+@pytest.mark.parametrize(("task", "n"), [("soccer_1v1", 32), ("soccer_2v2", 8)])
+def test_random_matches_for_200_steps(task, n):
+    env = make_env(task, num_worlds=n, seed=2, physics_options={"threads": 1})
+    agents = env.num_agents
+    generator = torch.Generator().manual_seed(0)
+    up = torch.zeros(n, agents)
+    for _ in range(200):
+        before = env.memory["down"]
+        result = env.step(0.5 * torch.randn(n, agents, 69, generator=generator))
+        assert torch.isfinite(result.obs).all() and torch.isfinite(result.reward).all()
+        assert result.valid.all()
+        up += (before >= 29) & (env.memory["down"] == 0)
+    assert env.physics.nan_worlds == 0
+    assert (up > 0).float().mean() > 0.5
+
+
+@pytest.mark.parametrize("task", ["penalty_kick", *TASKS])
+def test_the_seed_decides_and_a_permutation_of_the_worlds_permutes(task):
+    n = 4
+    order = torch.tensor([2, 0, 3, 1])
+    envs = [make_env(task, num_worlds=n, training=False) for _ in range(2)]
+    again = [make_env(task, num_worlds=n, seed=7) for _ in range(2)]
+    scene = envs[0].physics.scene
+    state = default_state(scene, n, "cpu")
+    generator = torch.Generator().manual_seed(7)
+    ball = scene.object_qpos("ball").start
+    # In soccer one scores, one is behind the line; a kick that ended would draw another target.
+    places = (4.0, 10.0, -2.8, 8.0) if task == "penalty_kick" else (4.0, 15.9, -2.8, -16.6)
+    state.qpos[:, ball] = torch.tensor(places)
+    state.qvel[:, scene.object_qvel("ball").start] = torch.tensor((0.0, 9.0, -5.0, 0.0))
+    target = torch.tensor((16.0, 0.5, 1.0)) + 0.1 * torch.rand(n, 3, generator=generator)
+    for env, rows in zip(envs, (torch.arange(n), order)):
+        everyone = torch.ones(n, dtype=torch.bool)
+        rows_state = PhysicsState(state.qpos[rows], state.qvel[rows], state.mocap_pos[rows])
+        env.physics.reset(everyone, rows_state)
+        env.view.refresh()
+        env.memory = env.task.begin(env.view, {"target": target[rows]})
+    for _ in range(12):
+        action = 0.6 * torch.randn(n, scene.num_agents, 69, generator=generator)
+        a, b = envs[0].step(action), envs[1].step(action[order])
+        c, d = (env.step(action) for env in again)
+        for name in ("obs", "final_obs", "reward", "terminated", "truncated", "valid"):
+            assert torch.equal(getattr(a, name)[order], getattr(b, name)), name
+            assert torch.equal(getattr(c, name), getattr(d, name)), name
+        for name, value in {**a.terms, **a.metrics}.items():
+            other = {**b.terms, **b.metrics}[name]
+            assert torch.equal(value[order].nan_to_num(-1), other.nan_to_num(-1)), name
+
+
+@pytest.mark.parametrize("task", ["penalty_kick", *TASKS])
+@pytest.mark.parametrize("name", ["warp", "drake"])
+def test_another_engine_plays_the_same_game(task, name):
+    """From the same start, standing still with the ball rolling: the same observations."""
+    if name == "warp":
+        pytest.importorskip("mujoco_warp")
+    else:
+        pytest.importorskip("pydrake")
+    n = 2 if name == "warp" else 1
+    options = {"device": "cpu"} if name == "warp" else {}
+    kinds = (("mujoco", {"threads": 1}), (name, options))
+    envs = [
+        make_env(task, engine=kind, num_worlds=n, training=False, physics_options=more)
+        for kind, more in kinds
+    ]
+    scene = envs[0].physics.scene
+    target = torch.tensor([(16.0, 0.5, 1.0)]).expand(n, 3)
+    for env in envs:
+        state = default_state(scene, n, "cpu")
+        q, v = scene.object_qpos("ball").start, scene.object_qvel("ball").start
+        state.qpos[:, q + 2] = 0.3
+        state.qvel[:, v : v + 3] = torch.tensor((1.0, 5.0, -1.0))
+        env.physics.reset(torch.ones(n, dtype=torch.bool), state)
+        env.view.refresh()
+        env.memory = env.task.begin(env.view, {"target": target})
+    for k in range(10 if name == "warp" else 5):
+        action = torch.zeros(n, scene.num_agents, 69)
+        a, b = (env.step(action) for env in envs)
+        apart = (a.obs - b.obs).abs()
+        if name == "warp":
+            assert apart.max() < 1e-3, k
+        else:  # a bounce lasts longer there, so what is compared is where things are
+            places = [at for f, at in envs[0].obs_slices.items() if f.endswith(("position", "goal"))]
+            assert len(places) > 1 and max(apart[..., at].max() for at in places) < 0.05, k
+        assert (a.reward - b.reward).abs().max() < 0.01
+        assert torch.equal(a.terminated, b.terminated)
+    assert int(envs[1].physics.nan_worlds) == 0 and int(envs[1].physics.overflow) == 0
