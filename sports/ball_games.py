@@ -176,8 +176,8 @@ def get_up(
     near. If all are taken, where it lies. One athlete of a world at a time: the next one's turn is
     a control step later.
 
-    ``down`` (N, A) steps since the fall of who has not got up. Returns the move, ``down`` with 0 for who got up, and
-    (N, A, 3) the roots after the move.
+    ``down`` (N, A) steps since the fall of who has not got up. Returns the move, ``down`` with 0
+    for who got up, and (N, A, 3) the roots after the move.
     """
     root, agents = view.root_pos, down.shape[1]
     ready = down * view.control_timestep >= GET_UP_SECONDS - 1e-6

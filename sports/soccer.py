@@ -48,8 +48,6 @@ LEAST_DISTANCE = 2.0
 """m; of starts anywhere. More than the rule's 1 m: arms are stretched out by 0.9 m."""
 LAYOUTS = 24
 """Drawn to find one with that distance; all fail once in 1e11 starts of five points."""
-ROWS_PER_ATHLETE, CONTACTS_PER_ATHLETE = 220, 40
-"""Reserved on a GPU: some lie on the ground, on each other."""
 
 
 @dataclass(frozen=True)
@@ -164,8 +162,6 @@ def scene(config: Soccer, body: Body, team_size: int) -> Scene:
             goal_frame("goal_right", 1.0),
         ),
         contact_pairs=touch_pairs(agents),
-        rows_per_world=ROWS_PER_ATHLETE * agents,
-        contacts_per_world=CONTACTS_PER_ATHLETE * agents,
         sites={"centre": (0.0, 0.0, 0.0)},
     )
 

@@ -1,4 +1,4 @@
-"""Games with a ball on states made by hand: who stands where, how the ball moves, who touches it."""
+"""Ball games on states made by hand: who stands where, how the ball moves, who touches it."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,8 +17,8 @@ from sports.physics.variation import Variation, draw
 from sports.scene import Scene, SceneObject
 
 G = 9.81
-FOOTBALL = dict(radius=0.11, mass=0.43, restitution=0.8, rolling=0.5)
-BASKETBALL = dict(radius=0.12, mass=0.6, restitution=0.85, rolling=0.3, grip=0.8)
+FOOTBALL: dict[str, Any] = dict(radius=0.11, mass=0.43, restitution=0.8, rolling=0.5)
+BASKETBALL: dict[str, Any] = dict(radius=0.12, mass=0.6, restitution=0.85, rolling=0.3, grip=0.8)
 
 
 def ball_scene(radius, mass, restitution, timestep=1 / 120, substeps=1, friction=1.0, **more):

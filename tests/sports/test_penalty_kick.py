@@ -52,11 +52,12 @@ def test_the_features_are_what_a_turned_kicker_sees():
     pitch.ball((5.0, 1.0, 0.5), (3.0, -2.0, 1.0))
     got = {k: v[0, 0].tolist() for k, v in pitch.features().items()}
     assert sum(map(len, got.values())) == 24
+    here = (0.0, 0.0, 0.0)
     want = {
         "ball_position": seen_from((5.0, 1.0, 0.5), root, yaw),
         # The ball is not turned: its x axis and y axis as seen from the heading.
-        "ball_rotation": seen_from((1, 0, 0), (0, 0, 0), yaw) + seen_from((0, 1, 0), (0, 0, 0), yaw),
-        "ball_velocity": seen_from((3.0, -2.0, 1.0), (0, 0, 0), yaw) + [0.0, 0.0, 0.0],
+        "ball_rotation": seen_from((1, 0, 0), here, yaw) + seen_from((0, 1, 0), here, yaw),
+        "ball_velocity": seen_from((3.0, -2.0, 1.0), here, yaw) + [0.0, 0.0, 0.0],
         "target": seen_from(TARGET, (5.0, 1.0, 0.5), yaw),
         "goal": seen_from((16, -2, 0), root, yaw)[:2] + seen_from((16, 2, 0), root, yaw)[:2],
         "spot": seen_from((4, 0, 0), root, yaw)[:2],
@@ -157,7 +158,9 @@ def test_a_second_touch_ends_it(steps, ends):
     assert bool(pitch.advance("agent0").terminated[0, 0]) is ends
 
 
-@pytest.mark.parametrize(("link", "foul"), [("R_Toe", 0), ("Head", 0), ("L_Hand", 1), ("R_Elbow", 1)])
+@pytest.mark.parametrize(
+    ("link", "foul"), [("R_Toe", 0), ("Head", 0), ("L_Hand", 1), ("R_Elbow", 1)]
+)
 def test_hands_and_arms_may_not_play_the_ball(link, foul):
     step = kicker().advance(f"agent0/{link}")
     assert bool(step.terminated[0, 0]) == bool(foul)
