@@ -22,15 +22,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sports import quaternion
-from sports.hoop import RIM_HEIGHT, aim, approach, crossing, hoop, rim_at
+from sports import ball_games, quaternion
+from sports.hoop import RIM_HEIGHT, aim, crossing, hoop
 from sports.humanoid.body import Body
 from sports.humanoid.hold import BASKETBALL, load_hold
 from sports.physics.base import PhysicsState
 from sports.scene import GROUND, Scene
-from sports.task import Advance, Memory, Task, View, length, nan_where, squared
+from sports.task import Advance, Memory, Task, View, constant, length, nan_where, squared
 
-RIM_X = 4.5
+RIM = (4.5, 0.0, RIM_HEIGHT)
 LINE_X = 0.3
 """How far forward the root may be while the ball is not free (m)."""
 LOWEST = 1.1
@@ -53,12 +53,11 @@ def scene(config: FreeThrow, body: Body) -> Scene:
     """The athlete with the ball before the basket. Raises ValueError for a body without
     fingers."""
     hold = load_hold("basketball")
-    rim = (RIM_X, 0.0, RIM_HEIGHT)
     return Scene(
         name="free_throw",
         body=body,
         agents=(hold.start(body),),
-        objects=(hold.placed(BASKETBALL), *hoop("hoop", rim, 1.0)),
+        objects=(hold.placed(BASKETBALL), *hoop("hoop", RIM, 1.0)),
         offset=hold.targets(body),
         steady=hold.steady(body),
         contact_pairs=(
@@ -114,7 +113,7 @@ def features(view: View, memory: Memory) -> dict[str, Tensor]:
             axes[..., 1],
             physics.object_linvel,
             physics.object_angvel,
-            rim_at(RIM_X, ball.device) - ball,
+            constant(RIM, ball.device) - ball,
             -root,
         ),
         dim=2,
@@ -134,7 +133,7 @@ def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
     physics = view.physics
     ball, velocity = physics.object_pos[:, 0], physics.object_linvel[:, 0]
-    rim = rim_at(RIM_X, ball.device)
+    rim = constant(RIM, ball.device)
     touched, left_foot, right_foot, landed = (physics.pair_force > 0).unbind(-1)
 
     # HELD, free for now, THROWN.
@@ -149,7 +148,7 @@ def advance(view: View, memory: Memory) -> Advance:
         return torch.where(flew, memory[name], now)
 
     aimed = at_release("aim", 0.5 * aim(ball, velocity, rim))
-    toward = at_release("toward", 0.5 * approach(ball, velocity, rim))
+    toward = at_release("toward", 0.5 * ball_games.toward(ball, velocity, rim))
 
     cross = crossing(memory["ball"], ball, rim, view.control_timestep)
     rises_through = cross.up & cross.inside

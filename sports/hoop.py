@@ -12,6 +12,7 @@ World frame, z up; m, s, rad. A basket counts downward only.
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from torch import Tensor
 from sports.humanoid.body import Shape
 from sports.physics.base import GRAVITY
 from sports.scene import SceneObject
-from sports.task import constant, length, squared
+from sports.task import squared
 
 RIM_HEIGHT, RING_RADIUS, RING_THICKNESS = 3.05, 0.23, 0.018
 """Upper side of the ring, its inner radius and the thickness of its metal (m)."""
@@ -33,14 +34,12 @@ BOARD_BEHIND = 0.375
 """From the rim's centre to the face of the backboard (m)."""
 APEX = 0.9
 """Highest point of the shot v* above the rim (m)."""
-FAST = 30.0
-"""Speed towards the rim that counts as 1 (m/s)."""
 _RING_COLOR, _BOARD_COLOR = (0.9, 0.35, 0.1, 1.0), (0.93, 0.94, 0.96, 1.0)
 
 
 def hoop(name: str, rim: tuple[float, float, float], side: float) -> tuple[SceneObject, ...]:
     """Ring and backboard around the middle ``rim`` of the ring; ``side`` is 1.0 where the board
-    stands beyond it along +x, -1.0 along -x. Named ``NAME_ring`` and ``NAME_board``."""
+    stands beyond it along +x, -1.0 along -x. Named ``NAME_rim`` and ``NAME_board``."""
     tube = RING_THICKNESS / 2
     # A polygon is nearer than its corners: corners and middles are as much too far as too near.
     radius = 2 * (RING_RADIUS + tube) / (1 + math.cos(math.pi / SEGMENTS))
@@ -49,7 +48,7 @@ def hoop(name: str, rim: tuple[float, float, float], side: float) -> tuple[Scene
         for a in (2 * math.pi * k / SEGMENTS for k in range(SEGMENTS + 1))
     ]
     ring = [
-        Shape("capsule", start, (tube,), 0.2, end=end) for start, end in zip(corners, corners[1:])
+        Shape("capsule", start, (tube,), 0.2, end=end) for start, end in itertools.pairwise(corners)
     ]
     inner = RING_RADIUS + RING_THICKNESS
     half = (BOARD_BEHIND - inner) / 2
@@ -65,7 +64,7 @@ def hoop(name: str, rim: tuple[float, float, float], side: float) -> tuple[Scene
         20.0,
     )
     return (
-        SceneObject(f"{name}_ring", (*ring, bracket), "fixed", rim, rgba=_RING_COLOR),
+        SceneObject(f"{name}_rim", (*ring, bracket), "fixed", rim, rgba=_RING_COLOR),
         SceneObject(f"{name}_board", (board,), "fixed", rim, rgba=_BOARD_COLOR),
     )
 
@@ -84,13 +83,6 @@ def shot(ball: Tensor, rim: Tensor) -> Tensor:
 def aim(ball: Tensor, velocity: Tensor, rim: Tensor) -> Tensor:
     """(...) exp(-0.1 |v - v*|^2): how like the shot a velocity (..., 3) is."""
     return torch.exp(-0.1 * squared(velocity - shot(ball, rim)))
-
-
-def approach(ball: Tensor, velocity: Tensor, rim: Tensor) -> Tensor:
-    """(...) speed towards the rim, 0 to 1 at ``FAST`` (``v_toward``)."""
-    way = rim - ball
-    speed = (velocity * way).sum(-1) / length(way).clamp(min=1e-6)
-    return (speed / FAST).clamp(0.0, 1.0)
 
 
 class Crossing(NamedTuple):
@@ -129,8 +121,3 @@ def crossing(before: Tensor, now: Tensor, rim: Tensor, timestep: float) -> Cross
         miss=torch.hypot(x, y),
         angle=torch.atan2(fall, torch.hypot(speed[..., 0], speed[..., 1])),
     )
-
-
-def rim_at(x: float, device: torch.device) -> Tensor:
-    """(3,) the middle of the rim over (x, 0)."""
-    return constant((x, 0.0, RIM_HEIGHT), device)

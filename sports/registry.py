@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from sports import (
+    basketball,
     boxing,
     fencing,
     free_throw,
@@ -38,6 +39,8 @@ _ALL = (
     soccer.SOCCER_1V1,
     soccer.SOCCER_2V2,
     free_throw.TASK,
+    basketball.BASKETBALL_1V1,
+    basketball.BASKETBALL_2V2,
 )
 _TASKS: dict[str, Task] = {task.name: task for task in _ALL}
 

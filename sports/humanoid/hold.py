@@ -48,11 +48,11 @@ BASKETBALL = SceneObject(
     pos=(0.35, 0.0, 1.5),
     friction=1.0,
     rgba=(0.85, 0.42, 0.15, 1.0),
-    solref=(-1e4, -10.0),
+    restitution=0.85,
+    grip=1.0,
     holdable=True,
 )
-"""It touches the floor for 30 ms (stiffness and damping by unit mass: 1e4 / s^2, 10 / s) and leaves
-it with 0.85 of its speed."""
+"""It leaves the floor, the ring and the board with 0.85 of its speed, but lies in the hands."""
 HELD = {"javelin": JAVELIN, "basketball": BASKETBALL}
 """What the holds are for, by their names."""
 HANDS = {"javelin": ("R",), "basketball": ("L", "R")}

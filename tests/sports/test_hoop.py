@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sports.hoop import BOARD_BEHIND, RIM_HEIGHT, RING_RADIUS, aim, approach, crossing, hoop, shot
+from sports.hoop import BOARD_BEHIND, RIM_HEIGHT, RING_RADIUS, aim, crossing, hoop, shot
 from sports.humanoid.body import load_body
 from sports.humanoid.hold import BASKETBALL
 from sports.physics import default_state, make_physics
@@ -50,17 +50,12 @@ def test_a_shot_from_above_the_apex_falls_from_there():
     torch.testing.assert_close(landed, RIM, rtol=0, atol=1e-5)
 
 
-def test_aim_and_approach_are_the_formulas():
+def test_aim_is_the_formula():
     velocity = torch.tensor((3.0, 0.5, 6.0))
     error = velocity - shot(LINE, RIM)
     wanted = math.exp(-0.1 * float(error.norm()) ** 2)
     assert float(aim(LINE, velocity, RIM)) == pytest.approx(wanted, rel=1e-5)
     assert float(aim(LINE, shot(LINE, RIM), RIM)) == 1.0
-    way = RIM - LINE
-    wanted = float(velocity @ way / way.norm()) / 30.0
-    assert float(approach(LINE, velocity, RIM)) == pytest.approx(wanted, rel=1e-5)
-    assert float(approach(LINE, -velocity, RIM)) == 0.0
-    assert float(approach(LINE, 20 * velocity, RIM)) == 1.0
 
 
 def test_a_crossing_is_where_a_parabola_crosses():
