@@ -123,9 +123,10 @@ def _panel(player: Player, window: Window, frame: int, image: Any, view: View, w
     dark = (30, 38, 46)
     zero = window.takeoff if window.takeoff is not None else 0
     seconds = (frame - zero) * player.episode.dt
-    around = {"stroke_width": 2, "stroke_fill": (240, 240, 240)}
+    around: dict[str, Any] = {"stroke_width": 2, "stroke_fill": (240, 240, 240)}
     ink.text((8, 6), f"{seconds:+.2f} s", font=large, fill=dark, **around)
     at = (view.width_px - 8, 8)
+    around["stroke_width"] = 1
     ink.text(at, _facts(player, frame), font=small, fill=dark, anchor="ra", **around)
     tone = (150, 30, 20) if words not in ("", "in the air") else dark
     ink.text((8, view.height_px - 20), words, font=small, fill=tone, **around)
