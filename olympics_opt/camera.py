@@ -29,7 +29,7 @@ BALL = 0.35
 """Least room around a ball or what else is thrown (m)."""
 INSET_ABOVE = 7.5
 """Where a picture is higher than this (m), a second one shows an athlete from near."""
-INSET_HEIGHT, INSET_SHARE = 2.9, 0.48
+INSET_HEIGHT, INSET_SHARE = 2.9, 0.42
 """The inset: metres from its lower to its upper edge, its share of the picture's height."""
 FIELD_HORIZON = 80.0
 """Fields are drawn to this distance behind the target (m)."""
@@ -60,7 +60,7 @@ _STANDS = {
     "fencing": Stand(azimuth=84.0, pitch=9.0),
     "boxing": Stand(azimuth=74.0, pitch=12.0),
     "penalty_kick": Stand(
-        azimuth=62.0, pitch=17.0, anchors=((16.0, -2.2, 0.0), (16.0, 2.2, 0.0), (16.0, 2.2, 2.2))
+        azimuth=62.0, pitch=17.0, anchors=((17.4, -2.1, 0.0), (16.0, 2.1, 0.0), (17.4, 2.1, 2.1))
     ),
     "soccer": Stand(pitch=32.0),
     "free_throw": Stand(pitch=7.0, anchors=((4.9, 0.0, 3.9),)),

@@ -246,11 +246,11 @@ def test_script_places_every_athlete_and_the_ball(name: str, tmp_path: Path) -> 
         episode.qpos[:, own.start + 7 : own.stop] = rng.uniform(-1, 1, scene.body.num_dofs)
     data = replay.replay_data(scene, [ReplayTrack.from_episode(episode, "a")])
     (tmp_path / "data.json").write_text(json.dumps(data))
-    script = tmp_path / "run.js"
+    script, table = tmp_path / "run.js", json.dumps(str(tmp_path / "data.json"))
     source = Path(replay.__file__).parent / "replay_scene.js"
     script.write_text(
         f"""const S = require({json.dumps(str(source))});
-        const data = JSON.parse(require("fs").readFileSync({json.dumps(str(tmp_path / "data.json"))}));
+        const data = JSON.parse(require("fs").readFileSync({table}));
         const scene = data.scene, track = data.tracks[0], rows = S.unpack(track.qpos);
         const mocap = track.mocap ? S.unpack(track.mocap) : rows.map(() => []);
         const width = 7 + 3 * (scene.links.length - 1), out = [];
