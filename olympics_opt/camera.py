@@ -16,6 +16,7 @@ import numpy as np
 
 from olympics_opt.episode import Player, heading
 from olympics_opt.raycast import View
+from olympics_opt.scenery.golf import FLAG_HEIGHT
 from sports.scene import Scene
 
 MARGIN = 1.16
@@ -28,7 +29,7 @@ BALL = 0.35
 """Least room around a ball or what else is thrown (m)."""
 INSET_ABOVE = 7.5
 """Where a picture is higher than this (m), a second one shows an athlete from near."""
-INSET_HEIGHT, INSET_SHARE = 2.9, 0.40
+INSET_HEIGHT, INSET_SHARE = 2.9, 0.42
 """The inset: metres from its lower to its upper edge, its share of the picture's height."""
 FIELD_HORIZON = 80.0
 """Fields are drawn to this distance behind the target (m)."""
@@ -46,18 +47,20 @@ class Stand:
     """Pictures up to this many metres high share one scale; the wider ones share another."""
     anchors: tuple[tuple[float, float, float], ...] = ()
     """Points that every picture holds."""
+    above_target: float = 0.0
+    """What stands at the target is so high (m)."""
 
 
 _STANDS = {
     "javelin": Stand(pitch=9.0),
-    "golf": Stand(azimuth=58.0, pitch=26.0),
+    "golf": Stand(azimuth=58.0, pitch=26.0, above_target=FLAG_HEIGHT),
     # From behind the athlete, as on television: along the court it would be a narrow strip.
     "tennis": Stand(azimuth=145.0, pitch=24.0, anchors=((-11.9, 0.0, 0.0), (11.9, 0.0, 0.0))),
     "table_tennis": Stand(pitch=14.0, anchors=((-1.4, 0.0, 0.7), (1.4, 0.0, 0.7))),
     "fencing": Stand(azimuth=84.0, pitch=9.0),
     "boxing": Stand(azimuth=74.0, pitch=12.0),
     "penalty_kick": Stand(
-        azimuth=62.0, pitch=17.0, anchors=((16.0, -2.2, 0.0), (16.0, 2.2, 0.0), (16.0, 2.2, 2.2))
+        azimuth=62.0, pitch=17.0, anchors=((17.4, -2.1, 0.0), (16.0, 2.1, 0.0), (17.4, 2.1, 2.1))
     ),
     "soccer": Stand(pitch=32.0),
     "free_throw": Stand(pitch=7.0, anchors=((4.9, 0.0, 3.9),)),
@@ -102,7 +105,8 @@ def must_show(player: Player, frame: int, view: View, own: Stand | None = None) 
         points += [p + s * room * axis for axis in (right, up) for s in (1, -1)]
     own = own or stand(player.scene)
     points += [np.asarray(a) for a in own.anchors] if own else []
-    points += list(player.targets(frame))
+    for p in player.targets(frame):
+        points += [p, p + (own.above_target if own else 0.0) * z]
     return np.array(points)
 
 

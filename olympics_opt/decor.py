@@ -107,6 +107,9 @@ def _paint(spec: mujoco.MjSpec, mark: Mark, layer: int) -> None:
         return
     middle = corners.mean(0)
     flat = corners - middle
+    x, y = flat.T
+    if (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() < 0:
+        flat = flat[::-1]  # counter-clockwise, or its faces would look inwards
     points = np.concatenate([np.c_[flat, np.full(len(flat), z)] for z in (-half, half)])
     name = f"mark{layer}"
     spec.add_mesh(

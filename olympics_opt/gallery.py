@@ -50,7 +50,7 @@ def shipped(task: str) -> str:
     return min(have, key=lambda name: not name.endswith("-human")) if have else "zero"
 
 
-def sample(task: str, policy: str, seed: int = 0) -> Episode:
+def sample(task: str, policy: str, seed: int = 0) -> Any:
     """An episode of a task, or its beginning where no policy plays it."""
     if policy != "zero":
         from rl.evaluate import evaluate

@@ -28,9 +28,8 @@ NEAR = 0.12
 """What is nearer to the ball than this (m) is what it touched."""
 FALLEN = 0.45
 """Height of the root (m) under which an athlete lies on the ground."""
-PAID = 0.5
-"""A reward term that jumps by this share of its greatest value, and seldom, is an event."""
-SELDOM = 0.02
+PRIZES = ("point", "goal", "basket", "bounce", "contact", "cleared")
+"""Reward terms that begin when something counts."""
 HANDS = ("Hand", "Wrist", "Index", "Middle", "Pinky", "Ring", "Thumb")
 
 
@@ -199,14 +198,13 @@ def _falls(player: Player) -> list[Event]:
 
 
 def _paid(player: Player) -> list[Event]:
-    """Where a reward term is paid that is paid seldom: a point, a goal, a basket."""
+    """Where a point, a goal, a basket begins to be paid."""
     found = []
     for name, table in getattr(player.episode, "terms", {}).items():
-        x = np.abs(np.asarray(table, dtype=float)).reshape(len(table), -1).max(1)
-        top = float(x.max(initial=0.0))
-        paid = np.flatnonzero(x > PAID * top) if top > 0 else np.zeros(0, dtype=int)
-        if 0 < len(paid) <= max(1, SELDOM * len(x)):
-            found += [Event(int(i), name, 3.0) for i in paid]
+        if name in PRIZES:
+            paid = np.abs(np.asarray(table, dtype=float)).reshape(len(table), -1).max(1) > 1e-6
+            begins = np.flatnonzero(paid & ~np.r_[False, paid[:-1]])
+            found += [Event(int(i), name, 3.0) for i in begins]
     return found
 
 

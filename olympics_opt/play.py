@@ -95,6 +95,7 @@ def play(
     ``processes`` is for Drake, which steps its worlds one after another.
     """
     from rl.evaluate import evaluate
+    from sports.registry import get_task
 
     with progress(f"playing {task}, {label or engine}") as bar:
         played = evaluate(
@@ -112,8 +113,11 @@ def play(
             processes=processes,
             progress=lambda done, total: bar.show(f"{done} of {total} trials", done, total),
         )
-        success = played.result["metrics"]["success"]["mean"]
-        bar.finish(f"{trials} trials, success {success:.0%}")
+        metrics = played.result["metrics"]
+        name = "success" if "success" in metrics else get_task(task).main_metric
+        mean, share = metrics[name]["mean"], metrics[name]["unit"] == "fraction"
+        text = "-" if mean is None else f"{mean:.0%}" if share else f"{mean:.3g}"
+        bar.finish(f"{trials} trials, {name} {text}")
     return played
 
 

@@ -27,8 +27,8 @@ __all__ = ["picture", "render_sheet", "render_video"]
 
 PANEL, WIDE_PANEL = (480, 330), (640, 400)
 """Width and height of a panel (pixels), and of one that shows a field."""
-TRAIL = (190, 60, 30)
-"""Colour of a ball's path."""
+TRAIL, TRAIL_SECONDS = (190, 60, 30), 3.0
+"""Colour of a ball's path, and how much of it is drawn (s)."""
 SMALL = 5.0
 """A ball of a smaller radius (pixels) gets a ring around it."""
 RULER_BELOW = math.radians(13.0)
@@ -123,9 +123,10 @@ def _panel(player: Player, window: Window, frame: int, image: Any, view: View, w
     dark = (30, 38, 46)
     zero = window.takeoff if window.takeoff is not None else 0
     seconds = (frame - zero) * player.episode.dt
-    around = {"stroke_width": 2, "stroke_fill": (240, 240, 240)}
+    around: dict[str, Any] = {"stroke_width": 2, "stroke_fill": (240, 240, 240)}
     ink.text((8, 6), f"{seconds:+.2f} s", font=large, fill=dark, **around)
     at = (view.width_px - 8, 8)
+    around["stroke_width"] = 1
     ink.text(at, _facts(player, frame), font=small, fill=dark, anchor="ra", **around)
     tone = (150, 30, 20) if words not in ("", "in the air") else dark
     ink.text((8, view.height_px - 20), words, font=small, fill=tone, **around)
@@ -241,7 +242,8 @@ def _strip(player: Player, title: str, columns: int | None, panel: tuple[int, in
     marks = ground_marks(episode.scene)
     panels = []
     for frame, view in zip(frames, shots(player, frames, *panel)):
-        image = picture(player, frame, view, marks, since=window.start)
+        since = max(window.start, frame - round(TRAIL_SECONDS / episode.dt))
+        image = picture(player, frame, view, marks, since=since)
         labels(ImageDraw.Draw(image), view, marks)
         words = _words(player, window, frame, happened)
         panels.append(_panel(player, window, frame, image, view, words))

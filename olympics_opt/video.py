@@ -24,6 +24,8 @@ from olympics_opt.scenery import ground_marks, terrain
 Pictures = Generator[np.ndarray, None, None]
 """(height, width, 3) uint8 frames."""
 
+NEAREST = 4.7
+"""Least distance of the camera (m)."""
 INSTALL_GL = (
     "no GL library works on this machine: `apt-get install libosmesa6` (or libegl1) gives "
     "MuJoCo's renderer one; the software renderer (--renderer software) needs none"
@@ -74,22 +76,25 @@ def _gl_frames(episode: Episode, width: int, height: int) -> Pictures:
     """Pictures of every frame by MuJoCo's renderer; the camera follows what matters."""
     ground = terrain(episode.scene, getattr(episode, "shown", {}))
     player = Player(episode, partial(decorated, ground=ground))
+    own = stand(player.scene)
+    lens = 1.0 / math.tan(math.radians(player.model.vis.global_.fovy) / 2)
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    if own is None:
+        root = smooth(player.qpos[:, :3], 0.25 / episode.dt)
+        looks = root * (1.0, 1.0, 0.75) + (0.35, 0.0, 0.15)
+        away = np.full(len(player), NEAREST)
+        camera.azimuth, camera.elevation = math.degrees(heading(player.qpos)) + 62.0, -9.0
+    else:
+        looks, away = focus(player, lens, width / height)
+        away = np.maximum(away, NEAREST)
+        camera.azimuth, camera.elevation = own.azimuth, -own.pitch
+        # The extent of the scene decides how far shadows reach; a near plane far from the eye
+        # tells thin layers of paint from each other. The renderer must be made after that.
+        extent = player.model.stat.extent = max(5.0, float(away.max()))
+        player.model.vis.map.znear = 0.2 * float(away.min()) / extent
     renderer = _gl_renderer(player.model, width, height)
     try:
-        own = stand(player.scene)
-        lens = 1.0 / math.tan(math.radians(player.model.vis.global_.fovy) / 2)
-        camera = mujoco.MjvCamera()
-        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        if own is None:
-            root = smooth(player.qpos[:, :3], 0.25 / episode.dt)
-            looks = root * (1.0, 1.0, 0.75) + (0.35, 0.0, 0.15)
-            away = np.full(len(player), 4.7)
-            camera.azimuth, camera.elevation = math.degrees(heading(player.qpos)) + 62.0, -9.0
-        else:
-            looks, away = focus(player, lens, width / height)
-            camera.azimuth, camera.elevation = own.azimuth, -own.pitch
-            # The extent of the scene decides what is clipped and how far shadows reach.
-            player.model.stat.extent = max(5.0, float(away.max()))
         sun = 0.8 * player.model.stat.extent
         for i in range(len(player)):
             player.show(i)
@@ -97,7 +102,7 @@ def _gl_frames(episode: Episode, width: int, height: int) -> Pictures:
             # The sun travels along, so that its shadow map covers the athletes' surroundings.
             player.model.light_pos[0] = looks[i] * (1.0, 1.0, 0.0) + sun * SUN
             mujoco.mj_camlight(player.model, player.data)
-            camera.lookat[:], camera.distance = looks[i], max(4.7, away[i])
+            camera.lookat[:], camera.distance = looks[i], away[i]
             renderer.update_scene(player.data, camera)
             yield renderer.render()
     finally:

@@ -39,6 +39,8 @@ __all__ = [
     "terrain",
 ]
 
+WALLS = 0.35
+"""Opacity of walls around a field."""
 Shown = Mapping[str, np.ndarray]
 Painter = Callable[[Scene], list[Mark]]
 Dresser = Callable[[Scene], list[SceneObject]]
@@ -119,7 +121,8 @@ def terrain(scene: Scene, shown: Shown | None = None) -> Terrain | None:
 
 
 def dressed(scene: Scene, shown: Shown | None = None) -> tuple[Scene, np.ndarray]:
-    """The scene with its props, for drawing: the same ``qpos``, more fixtures.
+    """The scene with its props, for drawing: the same ``qpos``, more fixtures. Walls are seen
+    through: the ball often lies behind one.
 
     Returns the scene, and (T, K, 3) or (1, K, 3) positions of the props that move, which are the
     last of its mocap objects.
@@ -136,7 +139,11 @@ def dressed(scene: Scene, shown: Shown | None = None) -> tuple[Scene, np.ndarray
             *(replace(o, name=f"{o.name}{a}") for a in range(spots.shape[1]) for o in flags),
         ]
         places = np.repeat(spots, len(flags), axis=1)
-    return replace(scene, objects=(*scene.objects, *props)), places
+    own = [
+        replace(o, rgba=(*o.rgba[:3], WALLS)) if o.name.startswith("wall") else o
+        for o in scene.objects
+    ]
+    return replace(scene, objects=(*own, *props)), places
 
 
 def complete_qpos(scene: Scene, qpos: np.ndarray) -> np.ndarray:

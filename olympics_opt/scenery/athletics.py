@@ -90,5 +90,5 @@ def javelin(scene: Scene) -> list[Mark]:
         marks.append(across(x, -half_width(x), half_width(x), 0.05, label=f"{metre} m"))
     reach = max(HALF_FIELD, first) + 0.75
     # The rule book's line is 0.07 m wide, and its edge nearer to the sector counts.
-    marks.append(across(LINE_X - 0.035, -reach, reach, 0.07, label="foul line"))
+    marks.append(across(LINE_X - 0.035, -reach, reach, 0.07))
     return marks

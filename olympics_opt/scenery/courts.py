@@ -15,6 +15,7 @@ from sports.fencing import HALF_LENGTH, HALF_WIDTH
 from sports.scene import Scene, SceneObject
 
 # Tennis (m): lines at most 5 cm, base lines 10 cm.
+BASE_X, SINGLES_Y = tennis_rules.HALF_LENGTH, tennis_rules.HALF_WIDTH
 DOUBLES_Y, SERVICE_X = 5.485, 6.40
 LINE, BASE_LINE, CENTRE_MARK = 0.05, 0.10, 0.10
 COURT, AROUND = "#86b08c", "#b4cdb0"
@@ -37,31 +38,15 @@ def tennis(scene: Scene) -> list[Mark]:
     """The court: singles inside doubles, service boxes and centre marks."""
     marks = [
         rectangle(-18.3, 18.3, -9.15, 9.15, AROUND),  # ITF: 6.40 m behind, 3.66 m beside the court
-        rectangle(
-            -tennis_rules.HALF_LENGTH, tennis_rules.HALF_LENGTH, -DOUBLES_Y, DOUBLES_Y, COURT
-        ),
+        rectangle(-BASE_X, BASE_X, -DOUBLES_Y, DOUBLES_Y, COURT),
     ]
-    for y in (tennis_rules.HALF_WIDTH, DOUBLES_Y):
-        marks += [
-            along(s * (y - LINE / 2), -tennis_rules.HALF_LENGTH, tennis_rules.HALF_LENGTH, LINE)
-            for s in (-1, 1)
-        ]
+    for y in (SINGLES_Y, DOUBLES_Y):
+        marks += [along(s * (y - LINE / 2), -BASE_X, BASE_X, LINE) for s in (-1, 1)]
     for s in (-1, 1):
         marks += [
-            across(
-                s * (tennis_rules.HALF_LENGTH - BASE_LINE / 2), -DOUBLES_Y, DOUBLES_Y, BASE_LINE
-            ),
-            across(
-                s * (SERVICE_X - LINE / 2), -tennis_rules.HALF_WIDTH, tennis_rules.HALF_WIDTH, LINE
-            ),
-            rectangle(
-                *sorted(
-                    (s * tennis_rules.HALF_LENGTH, s * (tennis_rules.HALF_LENGTH - CENTRE_MARK))
-                ),
-                -LINE / 2,
-                LINE / 2,
-                PAINT,
-            ),
+            across(s * (BASE_X - BASE_LINE / 2), -DOUBLES_Y, DOUBLES_Y, BASE_LINE),
+            across(s * (SERVICE_X - LINE / 2), -SINGLES_Y, SINGLES_Y, LINE),
+            across(s * (BASE_X - CENTRE_MARK / 2), -LINE / 2, LINE / 2, CENTRE_MARK),
         ]
     marks.append(along(0.0, -SERVICE_X, SERVICE_X, LINE))
     return marks

@@ -126,7 +126,7 @@ def _basket_half(rim_x: float) -> list[Mark]:
 
 def basketball(scene: Scene) -> list[Mark]:
     """The court around the scene's baskets: the whole of it for two, half of it for one."""
-    rims = [o.pos[0] for o in scene.objects if o.name.endswith("_ring")]
+    rims = [o.pos[0] for o in scene.objects if o.name.endswith("_rim")]
     end = max(rims) + RIM_TO_END
     start = -end if len(rims) > 1 else end - HALF_COURT
     half = _basket_half(max(rims))
@@ -146,9 +146,9 @@ def baskets(scene: Scene) -> list[SceneObject]:
     found = []
     objects = {o.name: o for o in scene.objects}
     for name, hoop in objects.items():
-        if not name.endswith("_ring"):
+        if not name.endswith("_rim"):
             continue
-        name = name.removesuffix("_ring")
+        name = name.removesuffix("_rim")
         board = objects[f"{name}_board"]
         (plate,) = board.shapes
         s = math.copysign(1.0, plate.center[0])

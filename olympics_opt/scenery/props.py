@@ -32,11 +32,6 @@ def rod(start: Point, end: Point, radius: float) -> Shape:
     return Shape("capsule", start, (radius,), 0.0, end=end)
 
 
-def ball(center: Point, radius: float) -> Shape:
-    """A ball."""
-    return Shape("sphere", center, (radius,), 0.0)
-
-
 def plate(start: Point, end: Point, radius: float) -> Shape:
     """A disc, or a rod with flat ends."""
     return Shape("cylinder", start, (radius,), 0.0, end=end)

@@ -64,7 +64,7 @@ def test_letting_go_of_what_a_hand_holds_is_an_event(name: str, thing: str) -> N
     assert not events(Player(still(scene, 50)))
 
 
-def test_hurdles_and_falls_and_rare_rewards_are_events() -> None:
+def test_hurdles_and_falls_and_prizes_are_events() -> None:
     scene = scene_of("hurdling")
     episode = still(scene, 100)
     episode.qpos[:, 0] = np.linspace(0, 33, 100)

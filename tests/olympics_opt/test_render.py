@@ -271,6 +271,13 @@ def test_the_decorated_model_keeps_the_state_and_touches_nothing(name: str) -> N
     assert not model.geom_contype[own].any() and not model.geom_conaffinity[own].any()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    for k in range(model.nmesh):  # faces look outwards, or they would be dark
+        first, count = model.mesh_vertadr[k], model.mesh_vertnum[k]
+        points = model.mesh_vert[first : first + count]
+        rows = slice(model.mesh_faceadr[k], model.mesh_faceadr[k] + model.mesh_facenum[k])
+        a, b, c = (points[model.mesh_face[rows][:, i]] for i in range(3))
+        out = np.einsum("ij,ij->i", np.cross(b - a, c - a), (a + b + c) / 3 - points.mean(0))
+        assert (out > -1e-12).all()
     for g, mark in zip(own, marks):
         middle = (np.max(mark.corners, axis=0) + np.min(mark.corners, axis=0)) / 2
         reach = np.linalg.norm(np.array(mark.corners) - middle, axis=1).max()

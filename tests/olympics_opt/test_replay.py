@@ -14,12 +14,15 @@ import mujoco
 import numpy as np
 import pytest
 
+from olympics_opt.episode import Player
 from olympics_opt.report import replay
 from olympics_opt.report.page import Fragment, Page, Section, render_page
 from olympics_opt.report.replay import ReplayTrack, aligned, pack, replay_html, unpack
+from olympics_opt.scenery import Terrain
 from sports.humanoid.body import load_body
 from sports.humanoid.mjcf import body_name, build_model
 from tests.olympics_opt.episodes import bar_scene, jump
+from tests.olympics_opt.scenes import scene_of, thrown
 
 
 def embedded(page: str) -> dict:
@@ -230,3 +233,119 @@ def test_headless_browser_draws_the_athlete(tmp_path: Path) -> None:
     ).stdout
     assert "<title>0.000 0.033 0.067 0.033 2.467 false</title>" in text
     assert re.search(r"height \d\.\d\d m", text)
+
+
+@pytest.mark.skipif(node() is None, reason="no node")
+@pytest.mark.parametrize("name", ["soccer_2v2", "table_tennis_1v1", "golf"])
+def test_script_places_every_athlete_and_the_ball(name: str, tmp_path: Path) -> None:
+    scene = scene_of(name)
+    episode = thrown(scene, (3.0, 1.0, 4.0))
+    rng = np.random.default_rng(2)
+    for agent in range(scene.num_agents):
+        own = scene.agent_qpos(agent)
+        episode.qpos[:, own.start + 7 : own.stop] = rng.uniform(-1, 1, scene.body.num_dofs)
+    data = replay.replay_data(scene, [ReplayTrack.from_episode(episode, "a")])
+    (tmp_path / "data.json").write_text(json.dumps(data))
+    script, table = tmp_path / "run.js", json.dumps(str(tmp_path / "data.json"))
+    source = Path(replay.__file__).parent / "replay_scene.js"
+    script.write_text(
+        f"""const S = require({json.dumps(str(source))});
+        const data = JSON.parse(require("fs").readFileSync({table}));
+        const scene = data.scene, track = data.tracks[0], rows = S.unpack(track.qpos);
+        const mocap = track.mocap ? S.unpack(track.mocap) : rows.map(() => []);
+        const width = 7 + 3 * (scene.links.length - 1), out = [];
+        rows.forEach((q, t) => {{
+          const links = [];
+          for (let a = 0; a < scene.agents; a++)
+            links.push(S.linkPoses(scene.links, q, a * width).map((pose) => pose.p));
+          out.push({{ links, objects: S.objectPoses(scene, q, mocap[t]).map((pose) => pose.p) }});
+        }});
+        console.log(JSON.stringify(out));"""
+    )
+    done = subprocess.run([str(node()), script], capture_output=True, text=True, check=True)
+    rows = json.loads(done.stdout)
+    player = Player(episode)
+    names = [o.name for o in player.scene.objects]
+    for t in (0, 20, 44):
+        found = player.show(t)
+        for agent, links in enumerate(rows[t]["links"]):
+            want = [found.body(body_name(agent, link)).xpos for link in scene.body.link_names]
+            assert np.abs(np.array(links) - want).max() < 1e-3
+        want = [found.body(name).xpos for name in names]
+        assert np.abs(np.array(rows[t]["objects"]) - want).max() < 1e-3
+
+
+def test_page_says_what_the_field_looks_like() -> None:
+    scene = scene_of("golf")
+    episode = thrown(scene, (6.0, 0.0, 6.0))
+    episode.shown = {
+        "target": np.tile([[14.0, 0.0, 0.2]], (45, 1)),
+        "phases": np.tile([[0.3, 2.0]], (45, 1)),
+    }
+    data = replay.replay_data(scene, [ReplayTrack.from_episode(episode, "a")])
+    turf, track = data["scene"]["terrain"], data["tracks"][0]
+    ground = Terrain((0.3, 2.0))
+    heights = np.array(turf["heights"])
+    x = np.linspace(turf["low"][0], turf["high"][0], heights.shape[1])
+    y = np.linspace(turf["low"][1], turf["high"][1], heights.shape[0])
+    assert np.abs(heights - ground.height(*np.meshgrid(x, y))).max() < 1e-3
+    assert np.allclose(unpack(track["mocap"]).reshape(45, -1, 3), (14.0, 0.0, 0.2), atol=1e-5)
+    for mark in data["scene"]["marks"]:
+        for corner in mark["corners"]:
+            assert corner[2] == pytest.approx(float(ground.height(corner[0], corner[1])), abs=0.011)
+    assert data["scene"]["subject"] == {"at": scene.object_qpos("ball").start, "name": "ball"}
+    flat = replay.replay_data(scene, [ReplayTrack("a", episode.qpos, 1 / 30)])
+    assert flat["scene"]["terrain"] is None
+    teams = replay.replay_data(
+        scene_of("boxing"), [ReplayTrack("a", scene_of("boxing").default_qpos(), 0.1)]
+    )
+    blue, red = teams["scene"]["colors"]
+    assert blue != red and len(blue) == len(teams["scene"]["links"])
+    nets = [
+        o
+        for o in replay.replay_data(
+            scene_of("tennis"), [ReplayTrack("a", scene_of("tennis").default_qpos(), 0.1)]
+        )["scene"]["objects"]
+        if o.get("net")
+    ]
+    assert len(nets) == 1 and nets[0]["alpha"] < 1
+
+
+@pytest.mark.skipif(chromium() is None, reason="no chromium")
+@pytest.mark.parametrize("name", ["soccer_2v2", "golf"])
+def test_headless_browser_draws_a_field(name: str, tmp_path: Path) -> None:
+    from PIL import Image
+
+    scene = scene_of(name)
+    episode = thrown(scene, (6.0, 1.0, 4.0))
+    if name == "golf":
+        episode.shown = {"phases": np.tile([[0.3, 2.0]], (45, 1))}
+    track = ReplayTrack.from_episode(episode, "a")
+    page = render_page(
+        Page(
+            name,
+            [
+                Section(
+                    "R", [Fragment(replay_html(scene, [track], title=name, element_id="player"))]
+                )
+            ],
+        )
+    )
+    errors = "<script>addEventListener('error', e => document.body.remove());</script>"
+    (tmp_path / "page.html").write_text(page.replace("<head>", "<head>" + errors))
+    picture = tmp_path / "page.png"
+    subprocess.run(
+        [
+            str(chromium()), "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
+            "--no-first-run", "--disable-background-networking", "--disable-component-update",
+            "--disable-sync", f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1000,800",
+            f"--screenshot={picture}", f"file://{tmp_path / 'page.html'}",
+        ],
+        capture_output=True, timeout=120, check=True,
+    )  # fmt: skip
+    pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)[:600]
+    red, green, blue = pixels[..., 0], pixels[..., 1], pixels[..., 2]
+    assert ((green > red + 25) & (green > blue + 25)).mean() > 0.2, "turf"
+    if name == "soccer_2v2":
+        assert ((blue > red + 60) & (blue > green + 20)).sum() > 30
+        assert ((red > blue + 60) & (red > green + 60)).sum() > 30

@@ -8,7 +8,6 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -17,7 +16,7 @@ import pytest
 from olympics_opt import viewer
 from olympics_opt.cli import main
 from olympics_opt.viewer import Pages, Session, server, watch
-from tests.olympics_opt.episodes import bar_scene, jump
+from tests.olympics_opt.episodes import Episode, bar_scene, jump
 
 
 @pytest.fixture
@@ -106,7 +105,7 @@ def test_a_policy_that_does_not_fit_is_told() -> None:
 
 
 def episode_pages() -> Pages:
-    def trial(number: int) -> SimpleNamespace:
+    def trial(number: int) -> Episode:
         episode = jump(bar_scene(), "high_jump", frames=10, takeoff=4, seed=number)
         episode.metrics = {"success": 1.0, "height": float(number)}
         return episode

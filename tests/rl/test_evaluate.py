@@ -191,6 +191,26 @@ def test_mistakes_are_sentences():
         evaluate("zero", "high_jump", engine="bullet", trials=1)
 
 
+def test_a_recording_keeps_what_its_task_shows(tmp_path):
+    """Golf's target and waves: those of the episode, also after the world has begun another."""
+    played = evaluate("zero", "golf", trials=2, num_worlds=2, seed=4, record=1)
+    first, second = played.recordings["best"], played.recordings["median"]
+    for recording in (first, second):
+        steps = len(recording.qpos)
+        assert recording.shown["target"].shape == (steps, 3)
+        assert recording.shown["phases"].shape == (steps, 2)
+        for table in recording.shown.values():
+            assert (table == table[0]).all()  # golf's do not change in an episode
+        assert 0.0 <= recording.shown["target"][0, 0] <= 20.0
+        recording.save(tmp_path / "golf.npz")
+        loaded = Recording.load(tmp_path / "golf.npz")
+        assert set(loaded.shown) == {"target", "phases"}
+        for name, table in recording.shown.items():
+            np.testing.assert_array_equal(loaded.shown[name], table)
+    if first.world != second.world:
+        assert (first.shown["phases"][0] != second.shown["phases"][0]).all()
+
+
 @pytest.mark.parametrize("processes", [2])
 def test_drake_trials_in_processes(processes):
     pytest.importorskip("pydrake")
