@@ -1,15 +1,15 @@
 """Basketball: one against one and two against two, on a whole court.
 
-The court is 28 + 1 m by 15 m; the rims are 12.925 m from its middle. Team 0 attacks +x. A basket is
-the ball's centre downward through a ring (``sports/hoop.py``); it ends the episode. A ball that
-came up through the ring must leave it first. A ball off the court is dropped at the nearest point
-inside from above all heads, and so is one that lies still on a ring, below where it lay. Source:
-SMPLOlympics section 4 for rewards; FIBA Official Basketball Rules for court, baskets and for the
-foot: a ball played with the leg from the knee down is a violation.
+The court is 29 x 15 m (FIBA's is a metre shorter), the rims are 12.925 m from its middle. Team 0
+attacks +x. A basket is the ball's centre downward through a ring (``sports/hoop.py``); it ends the
+episode. A ball that came up through the ring must leave it first. A ball off the court is dropped
+at the nearest point inside from above all heads, and so is one that lies still on a ring, below
+where it lay. Source: SMPLOlympics section 4 for rewards; FIBA Official Basketball Rules for the
+baskets and for the foot: kicking the ball is a violation.
 
 A foot on the ball is counted and brings that athlete nothing for a second: no reward, and a basket
 of its side within that second is void; it ends the episode and pays nobody. What the other side's
-basket costs it still costs. Everything else about the ball goes by contacts of hands with their
+basket costs it still costs. Who has the ball, and whose shot it is, goes by contacts of hands and
 fingers. Steps and dribbling are free, as in the paper.
 """
 

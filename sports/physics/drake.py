@@ -19,12 +19,18 @@ contact loses little, a stiff one more, by a law of the time step alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.geometry import GeometryId
+from pydrake.geometry import (
+    CollisionFilterDeclaration,
+    GeometryId,
+    GeometrySet,
+    SceneGraph,
+)
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
@@ -62,6 +68,7 @@ BOUNCE_LOSS = 1.7
 """Of Drake's discrete contact without dissipation: ``-ln(restitution) = BOUNCE_LOSS c`` where c is
 the time step times the contact's frequency sqrt(stiffness / mass), for c < 0.2 (measured in drops
 from 1 and 2 m; pi / 2 of an implicit Euler step, the rest is the ground's)."""
+_HELD = "held"
 
 
 @dataclass(frozen=True)
@@ -121,6 +128,7 @@ class DrakePhysics:
             (self._fixtures if added.frame is not None else self._free).append(added)
         plant.Finalize()
         filter_collisions(scene_graph, self._humanoids, [ground], points, shapes)
+        _separate_held(scene_graph, self._humanoids, shapes)
         self.diagram = builder.Build()
         self._roots = [self.diagram.CreateDefaultContext() for _ in range(n)]
         self._contexts = [plant.GetMyMutableContextFromRoot(root) for root in self._roots]
@@ -503,12 +511,17 @@ def _add_object(
 def _add_ball(
     plant: MultibodyPlant, rigid: RigidBody, ball: SceneObject, timestep: float
 ) -> tuple[list[GeometryId], list[GeometryId]]:
-    """A ball that bounces: (sphere for the ground, sphere for the rest)."""
+    """A ball that bounces: (sphere for the ground, sphere for the rest). What hands can hold has
+    one more for athletes alone, which is firm; then nothing but the ground rubs on the others."""
     assert ball.restitution is not None
     (sphere,) = ball.shapes
     frequency = -math.log(ball.restitution) / (BOUNCE_LOSS * timestep)
     stiffness = sphere.mass * frequency**2
     X_BS, geometry = drake_shape(sphere)
+    soft, firm = (stiffness, 0.0), (OBJECT_STIFFNESS, OBJECT_DISSIPATION)
+    surfaces = [("ground", ball.friction, soft), ("rest", ball.grip, soft)]
+    if ball.holdable:
+        surfaces[1:] = [("rest", 0.0, soft), (_HELD, ball.grip, firm)]
     # Drake combines two coefficients as 2 a b / (a + b), and the other surface has 1.
     found = [
         plant.RegisterCollisionGeometry(
@@ -516,11 +529,26 @@ def _add_ball(
             X_BS,
             geometry,
             f"{ball.name}_{against}",
-            contact_properties(friction / (2.0 - friction), stiffness, 0.0),
+            contact_properties(friction / (2.0 - friction), *compliance),
         )
-        for against, friction in (("ground", ball.friction), ("rest", ball.grip))
+        for against, friction, compliance in surfaces
     ]
     return found[:1], found[1:]
+
+
+def _separate_held(
+    scene_graph: SceneGraph, humanoids: Sequence[DrakeHumanoid], shapes: Sequence[GeometryId]
+) -> None:
+    """Of balls that hands can hold, athletes meet the firm sphere and the objects the soft one."""
+    inspector = scene_graph.model_inspector()
+    name = {g: inspector.GetName(g).split("::")[-1] for g in shapes}
+    held = [g for g in shapes if name[g].endswith(f"_{_HELD}")]
+    soft = [g for h in held for g in shapes if name[g] == name[h].replace(_HELD, "rest")]
+    athletes = [g for h in humanoids for own in h.shapes for g in own]
+    declare = CollisionFilterDeclaration()
+    declare.ExcludeBetween(GeometrySet(soft), GeometrySet(athletes))
+    declare.ExcludeBetween(GeometrySet(held), GeometrySet([g for g in shapes if g not in held]))
+    scene_graph.collision_filter_manager().Apply(declare)
 
 
 def _floating(joint: QuaternionFloatingJoint | None) -> tuple[int, int]:

@@ -10,7 +10,7 @@ import torch
 from sports.basketball import HALF_LENGTH, HALF_WIDTH, LIMBS
 from sports.env import make_env
 from sports.humanoid.body import load_body
-from sports.humanoid.hold import BASKETBALL
+from sports.humanoid.hold import BASKETBALL, load_hold
 from sports.physics import PhysicsState, default_state, make_physics
 from sports.scene import Scene
 from tests.sports.pitch import Pitch, seen_from, total
@@ -278,14 +278,19 @@ def test_a_kick_does_not_save_a_side_its_loss():
     assert pitch.advance(limb(1, "L_Ankle")).terms["basket"][0].tolist() == [10.0, -10.0]
 
 
-def test_waiting_with_the_ball_pays_little_beside_a_basket():
-    """Both palms on the ball for a second is worth an eighth of a basket at most."""
-    pitch = match(ball=(0.0, 0.0, 1.5))
-    earned = 0.0
-    for _ in range(30):
-        step = pitch.advance(limb(0, "L_Wrist"), limb(0, "R_Wrist"))
-        earned += float(total(step)[0, 0])
-    assert 0.0 <= earned + 30 * 0.1 * math.exp(-5 * 0.137) < 10.0 / 6
+def test_holding_the_ball_for_ever_is_worth_less_than_a_basket():
+    """Between the hands where the free throw begins, to the discount of training (0.99)."""
+    pitch, hold = match(), load_hold("basketball")
+    own = pitch.state.qpos[:, pitch.scene.agent_qpos(0)]
+    for dof, angle in hold.angles.items():
+        own[:, 7 + pitch.scene.body.dof_index(dof)] = angle
+    pitch.stand(0, 0.0, 0.0, z=hold.root_height)
+    pitch.ball(hold.pos)
+    pitch.advance(limb(0, "L_Wrist"))
+    step = pitch.advance(limb(0, "L_Wrist"), limb(0, "R_Wrist"))
+    paid = {name: float(term[0, 0]) for name, term in step.terms.items()}
+    assert paid["hands"] == pytest.approx(0.1 * math.exp(-5.0 * 0.14), abs=3e-3)
+    assert 0.0 < sum(paid.values()) / (1.0 - 0.99) < 10.0 / 1.5
 
 
 # What is put elsewhere.
