@@ -39,7 +39,7 @@ _RING_COLOR, _BOARD_COLOR = (0.9, 0.35, 0.1, 1.0), (0.93, 0.94, 0.96, 1.0)
 
 def hoop(name: str, rim: tuple[float, float, float], side: float) -> tuple[SceneObject, ...]:
     """Ring and backboard around the middle ``rim`` of the ring; ``side`` is 1.0 where the board
-    stands beyond it along +x, -1.0 along -x. Named ``NAME_ring`` and ``NAME_board``."""
+    stands beyond it along +x, -1.0 along -x. Named ``NAME_rim`` and ``NAME_board``."""
     tube = RING_THICKNESS / 2
     # A polygon is nearer than its corners: corners and middles are as much too far as too near.
     radius = 2 * (RING_RADIUS + tube) / (1 + math.cos(math.pi / SEGMENTS))
@@ -64,7 +64,7 @@ def hoop(name: str, rim: tuple[float, float, float], side: float) -> tuple[Scene
         20.0,
     )
     return (
-        SceneObject(f"{name}_ring", (*ring, bracket), "fixed", rim, rgba=_RING_COLOR),
+        SceneObject(f"{name}_rim", (*ring, bracket), "fixed", rim, rgba=_RING_COLOR),
         SceneObject(f"{name}_board", (board,), "fixed", rim, rgba=_BOARD_COLOR),
     )
 
