@@ -108,7 +108,7 @@ def touch_pairs(agents: int) -> tuple[tuple[str, str], ...]:
 def touches(view: View) -> tuple[Tensor, Tensor]:
     """(N, A) who touched the ball in the last control step, and who with hand or arm."""
     agents = view.physics.scene.num_agents
-    touch = view.physics.pair_force > 0.0
+    touch = view.physics.pair_force[:, : agents * (1 + len(ARMS))] > 0.0
     return touch[:, :agents], touch[:, agents:].unflatten(1, (agents, len(ARMS))).any(-1)
 
 

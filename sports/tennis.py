@@ -183,7 +183,7 @@ TASK = Task(
     advance=advance,
     metrics={
         "success": "fraction",
-        "hits": "returns",
+        "hits": "1/episode",
         "error": "m",
         "contacts": "strokes",
         "contact_rate": "fraction",
@@ -201,7 +201,7 @@ DUEL = dataclasses.replace(
     scene=scene_1v1,
     metrics={
         "success": "fraction",
-        "hits": "returns",
+        "hits": "1/episode",
         "error": "m",
         "rally": "strokes",
         "points_for": "fraction",

@@ -18,9 +18,9 @@ import torch
 
 from sports.env import Starts
 from sports.humanoid.body import load_body
-from sports.registry import task_names
 from warmstart.clip import Clip
 from warmstart.outcome import lowest
+from warmstart.problems import get_problem
 
 DATA = "data"
 CONTEXT = {"high_jump": ("bar_height",)}
@@ -143,8 +143,7 @@ def load_demonstrations(problem: str, strength: str | None = None) -> list[Clip]
 
     Raises ValueError for an unknown problem, or when none is shipped.
     """
-    if problem not in task_names():
-        raise ValueError(f"unknown problem '{problem}'; known: {', '.join(task_names())}")
+    get_problem(problem)
     clips = [Clip.load(path) for path in demonstration_files(problem)]
     clips = [c for c in clips if strength is None or c.meta.get("strength") == strength]
     if not clips:
