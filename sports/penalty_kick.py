@@ -8,8 +8,9 @@ inside |y| <= 2 m, z <= 2 m; it is out when it passes elsewhere or leaves the fi
 What the released reward leaves open is closed here: a ball that moves by less than
 ``LEAST_GAIN`` in a step does not get closer (rounding would switch the reward); the step in which
 it passes the plane is judged at the point where it passes, since behind the plane it gets further
-from the target; a touch with hand or arm ends the episode, and so does one with trunk or head before
-a leg has kicked the ball: PPO (27 M samples) sat down on it and let the pelvis squeeze it out.
+from the target; a touch with hand or arm ends the episode, and so does one with trunk or head
+before a leg has kicked the ball: PPO (27 M samples) sat down on it and let the pelvis squeeze it
+out.
 """
 
 from __future__ import annotations

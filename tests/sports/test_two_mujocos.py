@@ -1,4 +1,4 @@
-"""C MuJoCo in double precision and MuJoCo Warp in single (on its CPU device) play the same sport."""
+"""C MuJoCo in double precision and MuJoCo Warp in single, on a CPU, play the same sport."""
 
 from __future__ import annotations
 
