@@ -190,6 +190,7 @@ def begin(game: Game, view: View, context: Memory) -> Memory:
         "balls": torch.ones_like(zero[:, 0]),
         "strokes": zero.clone(),
         "returns": zero.clone(),
+        "nearest": zero.clone(),
         "error_sum": zero.clone(),
     }
 

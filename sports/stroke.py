@@ -28,10 +28,10 @@ class Stroke:
     """What rewards are made of, per agent (N, A)."""
 
     point: Point
-    reaching: Tensor
-    """bool: the ball is on its way to this athlete."""
-    racket_distance: Tensor
-    """Squared, from racket to ball (m^2)."""
+    near: Tensor
+    """exp(-sharpness d^2) of the distance from racket to ball, while the ball is on its way."""
+    closer: Tensor
+    """By how much that is more than ever since the last stroke or launch."""
     promising: Tensor
     """bool: its stroke will land in the court beyond the net, and has not yet."""
     miss: Tensor
@@ -42,8 +42,9 @@ class Stroke:
     """Strokes that landed there before this step."""
 
 
-def judge(game: Game, view: View, memory: Memory) -> Stroke:
-    """Applies the rules to the last control step and looks ahead."""
+def judge(game: Game, view: View, memory: Memory, sharpness: float) -> Stroke:
+    """Applies the rules to the last control step and looks ahead. ``sharpness`` (1/m^2) with which
+    nearness of racket and ball falls off."""
     physics = view.physics
     ball, linvel = physics.object_pos[:, 0], physics.object_linvel[:, 0]
     racket = racket_pos(game, view)
@@ -63,10 +64,11 @@ def judge(game: Game, view: View, memory: Memory) -> Stroke:
     spot, coming = predicted(game, view, point.hitter, flying)
     to_target = spot[:, None] - memory["target"]
     landed = point.landed[:, None] & (point.landed_by[:, None] == sides)
+    near = (-sharpness * squared(racket - ball[:, None])).exp() * ~own
     return Stroke(
         point=point,
-        reaching=~own,
-        racket_distance=squared(racket - ball[:, None]),
+        near=near,
+        closer=(near - memory["nearest"]).clamp(min=0.0),
         promising=own & coming[:, None],
         miss=to_target[..., 0].square() + to_target[..., 1].square(),
         landed=landed & has_struck,
@@ -121,7 +123,10 @@ def conclude(
     error_sum = memory["error_sum"] + error.masked_fill(~stroke.landed, 0.0)
     hits, errors = returns.sum(-1), error_sum.sum(-1)
     metrics = {"hits": hits, "error": nan_where(hits == 0, errors / hits.clamp(min=1.0))}
+    nearest = torch.maximum(memory["nearest"], stroke.near)
+    nearest = nearest.masked_fill(point.struck.any(-1, keepdim=True), 0.0)
     common = {**memory, "strokes": strokes, "returns": returns, "error_sum": error_sum}
+    common["nearest"] = nearest
     step = _solo if agents == 1 else _duel
     return step(game, view, common, point, metrics, terms)
 
@@ -149,6 +154,7 @@ def _solo(
         "bounced": point.bounced & ~again,
         "target": torch.where(row[..., None], aims(game, luck, 1), memory["target"]),
         "balls": memory["balls"] + again,
+        "nearest": memory["nearest"].masked_fill(row, 0.0),
     }
     contacts, success = memory["strokes"][:, 0], metrics["hits"] > 0
     metrics |= {

@@ -81,6 +81,10 @@ class TableTennis:
     ball_path: bool = False
     """Whether athletes see where the ball will be in 0.05, 0.10, ... 0.50 s, bouncing at the
     table's height."""
+    shadow: bool = True
+    """Pay how near racket and ball are in every step before a stroke, as the paper does. False: pay
+    only what is nearer than ever to this ball. Following the ball with the paddle to its second
+    bounce earns more than risking a stroke (PPO, 24 M samples)."""
 
 
 def table() -> SceneObject:
@@ -141,10 +145,10 @@ def features(view: View, memory: Memory) -> dict[str, torch.Tensor]:
 
 def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
-    now = stroke.judge(GAME, view, memory)
+    now = stroke.judge(GAME, view, memory, SHARPNESS)
     worth = 1.0 + (-now.miss).exp() + now.returns
     terms = {
-        "approach": (-SHARPNESS * now.racket_distance).exp() * now.reaching,
+        "approach": now.near if view.config.shadow else now.closer,
         "landing": worth * now.promising,
     }
     return stroke.conclude(GAME, view, memory, now, terms)

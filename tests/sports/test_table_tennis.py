@@ -74,6 +74,23 @@ def test_before_contact_the_paddle_is_led_to_the_ball():
         assert step.terms["landing"][0, 0] == 0.0
 
 
+def test_following_the_ball_may_earn_nothing():
+    """Without ``shadow`` only what is nearer than ever to this ball is paid: the sum is the best
+    of the way, whatever the way; the next ball pays anew."""
+    world = rally(shadow=False)
+    paddle = tuple(a + b for a, b in zip((2.0, 0.0, STANDING), (-PADDLE[0], -PADDLE[1], PADDLE[2])))
+    paid = []
+    for d in (0.5, 0.3, 0.4, 0.3, 0.2):
+        step = world.go((paddle[0] - d, paddle[1], paddle[2]), (0.0, 0.0, 0.0))
+        paid.append(float(step.terms["approach"][0, 0]))
+    value = {d: math.exp(-4.0 * d * d) for d in (0.5, 0.3, 0.2)}
+    assert paid[2] == paid[3] == 0.0
+    assert paid[1] == pytest.approx(value[0.3] - value[0.5], abs=2e-3)
+    assert paid[4] == pytest.approx(value[0.2] - value[0.3], abs=2e-3)
+    stroke(world)
+    assert world.env.memory["nearest"][0, 0] == 0.0
+
+
 def test_after_contact_it_pays_for_the_landing_and_for_the_returns_so_far():
     world = rally()
     for returns in range(3):
