@@ -104,11 +104,14 @@ def test_mistakes_get_a_sentence():
         OlympicsEnv("swimming")
 
 
-def test_the_example_of_the_readme_runs():
+def test_the_examples_of_the_readme_run():
     text = (Path(__file__).parents[2] / "README.md").read_text()
-    (example,) = re.findall(r"```python\n(.*?)```", text, re.S)
+    worlds, match = re.findall(r"```python\n(.*?)```", text, re.S)
     found: dict = {}
-    exec(example.replace("num_envs=256", "num_envs=2"), found)
+    exec(match, found)
+    assert set(found["rewards"]) == {"athlete_0", "athlete_1"} == set(found["terminations"])
+    found["match"].close()
+    exec(worlds.replace("num_envs=256", "num_envs=2"), found)
     assert found["obs"].shape == (2, found["envs"].single_observation_space.shape[0])
     found["envs"].close()
 
