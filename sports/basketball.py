@@ -223,6 +223,7 @@ def advance(view: View, memory: Memory) -> Advance:
         terms=terms,
         terminated=(scored != 0)[:, None].expand_as(fallen),
         metrics={
+            "success": (counted > 0).float(),
             "baskets_for": (counted > 0).float(),
             "baskets_against": (counted < 0).float(),
             "possession": share,
@@ -263,6 +264,7 @@ def _match(team_size: int, summary: str) -> Task:
         features=features,
         advance=advance,
         metrics={
+            "success": "fraction",
             "baskets_for": "baskets",
             "baskets_against": "baskets",
             "possession": "fraction",

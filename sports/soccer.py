@@ -290,6 +290,7 @@ def advance(view: View, memory: Memory) -> Advance:
         terms=terms,
         terminated=terminated,
         metrics={
+            "success": (counted > 0).float(),
             "goals_for": (counted > 0).float(),
             "goals_against": (counted < 0).float(),
             "possession": share,
@@ -311,6 +312,7 @@ def _match(team_size: int, summary: str) -> Task:
         features=features,
         advance=advance,
         metrics={
+            "success": "fraction",
             "goals_for": "goals",
             "goals_against": "goals",
             "possession": "fraction",

@@ -50,6 +50,14 @@ def test_two_hundred_random_steps_are_finite(task):
 
 
 @pytest.mark.parametrize("task", task_names())
+def test_a_task_says_what_a_success_is(task):
+    """Verification compares success rates on two engines, evaluation ranks by the main metric."""
+    record = get_task(task)
+    assert record.metrics["success"] == "fraction" and record.main_metric in record.metrics
+    assert record.summary.endswith(".")
+
+
+@pytest.mark.parametrize("task", task_names())
 def test_the_observation_is_what_its_slices_say(task):
     env = make_env(task, num_worlds=2, training=False)
     felt = proprioception_slices(env.physics.scene.body.num_links)
