@@ -19,22 +19,16 @@ contact loses little, a stiff one more, by a law of the time step alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.geometry import (
-    CollisionFilterDeclaration,
     GeometryId,
-    GeometrySet,
-    SceneGraph,
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, QuaternionFloatingJoint, RigidBody
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.systems.framework import Context
 from torch import Tensor
 
@@ -42,46 +36,24 @@ from sports import quaternion
 from sports.ball_law.compiled import for_cpu
 from sports.humanoid.drake_plant import (
     OBJECT_DISSIPATION,
-    OBJECT_STIFFNESS,
     DrakeHumanoid,
     add_ground,
     add_humanoid,
-    add_shapes,
-    contact_properties,
-    drake_shape,
     filter_collisions,
-    link_inertia,
     rotate,
     start_plant,
 )
 from sports.humanoid.mjcf import build_model
 from sports.physics.base import Geometry, PhysicsState, diverged
+from sports.physics.drake_objects import PlantObject, add_object, floating, separate_held
 from sports.physics.game import build_game, has_game
-from sports.scene import GROUND, Scene, SceneObject
+from sports.scene import GROUND, Scene
 
 MAX_TIMESTEP = 1.0 / 480.0
 """Largest time step (s) chosen on its own: standing joints then follow MuJoCo to 1e-3 rad."""
 BOUNCE_TIMESTEP = 1.0 / 960.0
 """The same of a scene with a ball that bounces, whose contact must be soft for its time step: at
 1/480 s a kick at 15 m/s would go through it."""
-BOUNCE_LOSS = 1.7
-"""Of Drake's discrete contact without dissipation: ``-ln(restitution) = BOUNCE_LOSS c`` where c is
-the time step times the contact's frequency sqrt(stiffness / mass), for c < 0.2 (measured in drops
-from 1 and 2 m; pi / 2 of an implicit Euler step, the rest is the ground's)."""
-_HELD = "held"
-
-
-@dataclass(frozen=True)
-class _Object:
-    """A free object or a fixture in the plant."""
-
-    name: str
-    rigid: RigidBody
-    frame: FixedOffsetFrame | None
-    """Frame F of a fixture, whose X_WF is a context parameter; None for a free object."""
-    joint: QuaternionFloatingJoint | None
-    """Of a free object with the world: q = [quaternion wxyz, p_WB], v = [w_WB_W, v_WBo_W]."""
-    quat: tuple[float, float, float, float]
 
 
 class DrakePhysics:
@@ -118,17 +90,17 @@ class DrakePhysics:
         ]
         points: list[GeometryId] = []
         shapes: list[GeometryId] = []
-        self._free: list[_Object] = []
-        self._fixtures: list[_Object] = []
+        self._free: list[PlantObject] = []
+        self._fixtures: list[PlantObject] = []
         for obj in scene.objects:
             losses = OBJECT_DISSIPATION
             if scene.bouncing and obj.motion != "free":
                 losses = 0.0  # a wall must leave a ball the restitution that it has
-            added = _add_object(plant, obj, self.timestep, losses, points, shapes)
+            added = add_object(plant, obj, self.timestep, losses, points, shapes)
             (self._fixtures if added.frame is not None else self._free).append(added)
         plant.Finalize()
         filter_collisions(scene_graph, self._humanoids, [ground], points, shapes)
-        _separate_held(scene_graph, self._humanoids, shapes)
+        separate_held(scene_graph, self._humanoids, shapes)
         self.diagram = builder.Build()
         self._roots = [self.diagram.CreateDefaultContext() for _ in range(n)]
         self._contexts = [plant.GetMyMutableContextFromRoot(root) for root in self._roots]
@@ -246,7 +218,7 @@ class DrakePhysics:
             p, quat = np.split(qpos[scene.object_qpos(obj.name)], [3])
             linear, spin = np.split(qvel[scene.object_qvel(obj.name)], [3])
             quat = quat / np.linalg.norm(quat)
-            start, start_v = _floating(obj.joint)
+            start, start_v = floating(obj.joint)
             q[start : start + 7] = (*quat, *p)
             v[start_v : start_v + 6] = (*rotate(quat, spin), *linear)
         self.plant.SetPositions(context, q)
@@ -320,7 +292,7 @@ class DrakePhysics:
         p, quat = np.split(self._qpos[world, self.scene.object_qpos(name)], [3])
         linear, spin = np.split(self._qvel[world, self.scene.object_qvel(name)], [3])
         q, v = self.plant.GetPositions(context), self.plant.GetVelocities(context)
-        start, start_v = _floating(joint)
+        start, start_v = floating(joint)
         q[start : start + 7] = (*quat, *p)
         v[start_v : start_v + 6] = (*rotate(quat, spin), *linear)
         self.plant.SetPositions(context, q)
@@ -410,7 +382,7 @@ class DrakePhysics:
                     own_q[:, humanoid.q_index], own_v[:, humanoid.v_index]
                 )
             for obj in self._free:
-                start, start_v = _floating(obj.joint)
+                start, start_v = floating(obj.joint)
                 quat = own_q[:, start : start + 4]
                 quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
                 w_W = own_v[:, start_v : start_v + 3]
@@ -466,95 +438,6 @@ def _substeps(scene: Scene, timestep: float | None) -> int:
             f"{scene.control_timestep:.6g} s, which {timestep:.6g} s does not"
         )
     return count
-
-
-def _add_object(
-    plant: MultibodyPlant,
-    obj: SceneObject,
-    timestep: float,
-    dissipation: float,
-    points: list[GeometryId],
-    shapes: list[GeometryId],
-) -> _Object:
-    """Adds a scene object; its geometries are appended to ``points`` and ``shapes``."""
-    instance = plant.AddModelInstance(obj.name)
-    rigid = plant.AddRigidBody(obj.name, instance, link_inertia(obj.shapes))
-    frame, joint = None, None
-    if obj.motion in ("free", "ball"):
-        damping = obj.rolling_damping() if obj.rolling else 0.0
-        joint = QuaternionFloatingJoint(
-            obj.name, plant.world_frame(), rigid.body_frame(), angular_damping=damping
-        )
-        joint = plant.AddJoint(joint)
-    else:
-        X_WF = RigidTransform(Quaternion(np.array(obj.quat, dtype=float)), np.array(obj.pos))
-        frame = plant.AddFrame(FixedOffsetFrame(f"{obj.name}_fixture", plant.world_frame(), X_WF))
-        plant.WeldFrames(frame, rigid.body_frame())
-    if obj.motion == "ball":  # touches what the ball law says
-        return _Object(obj.name, rigid, frame, joint, obj.quat)
-    if obj.restitution is not None:
-        own = _add_ball(plant, rigid, obj, timestep)
-    else:
-        own = add_shapes(
-            plant,
-            rigid,
-            obj.name,
-            obj.shapes,
-            contact_properties(obj.friction, OBJECT_STIFFNESS, dissipation),
-            ground=obj.motion == "free" and obj.meets_ground,
-        )
-    points.extend(own[0])
-    shapes.extend(own[1])
-    return _Object(obj.name, rigid, frame, joint, obj.quat)
-
-
-def _add_ball(
-    plant: MultibodyPlant, rigid: RigidBody, ball: SceneObject, timestep: float
-) -> tuple[list[GeometryId], list[GeometryId]]:
-    """A ball that bounces: (sphere for the ground, sphere for the rest). What hands can hold has
-    one more for athletes alone, which is firm; then nothing but the ground rubs on the others."""
-    assert ball.restitution is not None
-    (sphere,) = ball.shapes
-    frequency = -math.log(ball.restitution) / (BOUNCE_LOSS * timestep)
-    stiffness = sphere.mass * frequency**2
-    X_BS, geometry = drake_shape(sphere)
-    soft, firm = (stiffness, 0.0), (OBJECT_STIFFNESS, OBJECT_DISSIPATION)
-    surfaces = [("ground", ball.friction, soft), ("rest", ball.grip, soft)]
-    if ball.holdable:
-        surfaces[1:] = [("rest", 0.0, soft), (_HELD, ball.grip, firm)]
-    # Drake combines two coefficients as 2 a b / (a + b), and the other surface has 1.
-    found = [
-        plant.RegisterCollisionGeometry(
-            rigid,
-            X_BS,
-            geometry,
-            f"{ball.name}_{against}",
-            contact_properties(friction / (2.0 - friction), *compliance),
-        )
-        for against, friction, compliance in surfaces
-    ]
-    return found[:1], found[1:]
-
-
-def _separate_held(
-    scene_graph: SceneGraph, humanoids: Sequence[DrakeHumanoid], shapes: Sequence[GeometryId]
-) -> None:
-    """Of balls that hands can hold, athletes meet the firm sphere and the objects the soft one."""
-    inspector = scene_graph.model_inspector()
-    name = {g: inspector.GetName(g).split("::")[-1] for g in shapes}
-    held = [g for g in shapes if name[g].endswith(f"_{_HELD}")]
-    soft = [g for h in held for g in shapes if name[g] == name[h].replace(_HELD, "rest")]
-    athletes = [g for h in humanoids for own in h.shapes for g in own]
-    declare = CollisionFilterDeclaration()
-    declare.ExcludeBetween(GeometrySet(soft), GeometrySet(athletes))
-    declare.ExcludeBetween(GeometrySet(held), GeometrySet([g for g in shapes if g not in held]))
-    scene_graph.collision_filter_manager().Apply(declare)
-
-
-def _floating(joint: QuaternionFloatingJoint | None) -> tuple[int, int]:
-    """Where a free object's quaternion starts in q and its angular velocity in v."""
-    assert joint is not None
-    return joint.position_start(), joint.velocity_start()
 
 
 __all__ = ["MAX_TIMESTEP", "DrakeHumanoid", "DrakePhysics"]

@@ -1,0 +1,137 @@
+"""Scene objects in a Drake plant: free ones, fixtures, balls that bounce, what hands can hold."""
+
+# The stubs of Drake type arrays, ports and modules more narrowly than they are.
+# pyright: reportArgumentType=false, reportCallIssue=false
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, QuaternionFloatingJoint, RigidBody
+
+from sports.humanoid.drake_plant import (
+    OBJECT_DISSIPATION,
+    OBJECT_STIFFNESS,
+    DrakeHumanoid,
+    add_shapes,
+    contact_properties,
+    drake_shape,
+    link_inertia,
+)
+from sports.scene import SceneObject
+
+BOUNCE_LOSS = 1.7
+"""Of Drake's discrete contact without dissipation: ``-ln(restitution) = BOUNCE_LOSS c`` where c is
+the time step times the contact's frequency sqrt(stiffness / mass), for c < 0.2 (measured in drops
+from 1 and 2 m; pi / 2 of an implicit Euler step, the rest is the ground's)."""
+_HELD = "held"
+
+
+@dataclass(frozen=True)
+class PlantObject:
+    """A free object or a fixture in the plant."""
+
+    name: str
+    rigid: RigidBody
+    frame: FixedOffsetFrame | None
+    """Frame F of a fixture, whose X_WF is a context parameter; None for a free object."""
+    joint: QuaternionFloatingJoint | None
+    """Of a free object with the world: q = [quaternion wxyz, p_WB], v = [w_WB_W, v_WBo_W]."""
+    quat: tuple[float, float, float, float]
+
+
+def add_object(
+    plant: MultibodyPlant,
+    obj: SceneObject,
+    timestep: float,
+    dissipation: float,
+    points: list[GeometryId],
+    shapes: list[GeometryId],
+) -> PlantObject:
+    """Adds a scene object; its geometries are appended to ``points`` and ``shapes``."""
+    instance = plant.AddModelInstance(obj.name)
+    rigid = plant.AddRigidBody(obj.name, instance, link_inertia(obj.shapes))
+    frame, joint = None, None
+    if obj.motion in ("free", "ball"):
+        damping = obj.rolling_damping() if obj.rolling else 0.0
+        joint = QuaternionFloatingJoint(
+            obj.name, plant.world_frame(), rigid.body_frame(), angular_damping=damping
+        )
+        joint = plant.AddJoint(joint)
+    else:
+        X_WF = RigidTransform(Quaternion(np.array(obj.quat, dtype=float)), np.array(obj.pos))
+        frame = plant.AddFrame(FixedOffsetFrame(f"{obj.name}_fixture", plant.world_frame(), X_WF))
+        plant.WeldFrames(frame, rigid.body_frame())
+    if obj.motion == "ball":  # touches what the ball law says
+        return PlantObject(obj.name, rigid, frame, joint, obj.quat)
+    if obj.restitution is not None:
+        own = _add_ball(plant, rigid, obj, timestep)
+    else:
+        own = add_shapes(
+            plant,
+            rigid,
+            obj.name,
+            obj.shapes,
+            contact_properties(obj.friction, OBJECT_STIFFNESS, dissipation),
+            ground=obj.motion == "free" and obj.meets_ground,
+        )
+    points.extend(own[0])
+    shapes.extend(own[1])
+    return PlantObject(obj.name, rigid, frame, joint, obj.quat)
+
+
+def _add_ball(
+    plant: MultibodyPlant, rigid: RigidBody, ball: SceneObject, timestep: float
+) -> tuple[list[GeometryId], list[GeometryId]]:
+    """A ball that bounces: (sphere for the ground, sphere for the rest). What hands can hold has
+    one more for athletes alone, which is firm; then nothing but the ground rubs on the others."""
+    assert ball.restitution is not None
+    (sphere,) = ball.shapes
+    frequency = -math.log(ball.restitution) / (BOUNCE_LOSS * timestep)
+    stiffness = sphere.mass * frequency**2
+    X_BS, geometry = drake_shape(sphere)
+    soft, firm = (stiffness, 0.0), (OBJECT_STIFFNESS, OBJECT_DISSIPATION)
+    surfaces = [("ground", ball.friction, soft), ("rest", ball.grip, soft)]
+    if ball.holdable:
+        surfaces[1:] = [("rest", 0.0, soft), (_HELD, ball.grip, firm)]
+    # Drake combines two coefficients as 2 a b / (a + b), and the other surface has 1.
+    found = [
+        plant.RegisterCollisionGeometry(
+            rigid,
+            X_BS,
+            geometry,
+            f"{ball.name}_{against}",
+            contact_properties(friction / (2.0 - friction), *compliance),
+        )
+        for against, friction, compliance in surfaces
+    ]
+    return found[:1], found[1:]
+
+
+def separate_held(
+    scene_graph: SceneGraph, humanoids: Sequence[DrakeHumanoid], shapes: Sequence[GeometryId]
+) -> None:
+    """Of balls that hands can hold, athletes meet the firm sphere and the objects the soft one."""
+    inspector = scene_graph.model_inspector()
+    name = {g: inspector.GetName(g).split("::")[-1] for g in shapes}
+    held = [g for g in shapes if name[g].endswith(f"_{_HELD}")]
+    soft = [g for h in held for g in shapes if name[g] == name[h].replace(_HELD, "rest")]
+    athletes = [g for h in humanoids for own in h.shapes for g in own]
+    declare = CollisionFilterDeclaration()
+    declare.ExcludeBetween(GeometrySet(soft), GeometrySet(athletes))
+    declare.ExcludeBetween(GeometrySet(held), GeometrySet([g for g in shapes if g not in held]))
+    scene_graph.collision_filter_manager().Apply(declare)
+
+
+def floating(joint: QuaternionFloatingJoint | None) -> tuple[int, int]:
+    """Where a free object's quaternion starts in q and its angular velocity in v."""
+    assert joint is not None
+    return joint.position_start(), joint.velocity_start()
