@@ -8,6 +8,7 @@ sees and earns the same (``tests/sports/test_soccer.py``). The ball is the first
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import cache
 
 import torch
@@ -61,8 +62,9 @@ def attack(view: View) -> Tensor:
     return constant(signs, view.clock.device)
 
 
-def seen(view: View) -> dict[str, Tensor]:
-    """The ball, the mates and the opponents as each athlete sees them.
+def seen(view: View, field: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
+    """The ball, then the ``field`` (features of the sport's own), the mates and the opponents as
+    each athlete sees them.
 
     For each (``ball``, ``mate1``, ..., ``opponent1``, ...) ``_position`` from the own root (N, A,
     3), ``_rotation`` 6-D (N, A, 6), ``_velocity`` linear and angular (N, A, 6), all in the own
@@ -88,11 +90,17 @@ def seen(view: View) -> dict[str, Tensor]:
     mates = agents // 2 - 1
     names = [f"mate{k + 1}" for k in range(mates)]
     names += [f"opponent{k + 1}" for k in range(agents - 1 - max(mates, 0))]
-    features = {}
-    for k, name in [(agents - 1, "ball"), *enumerate(names)]:
-        features[f"{name}_position"] = of_each[:, :, k, 0]
-        features[f"{name}_rotation"] = of_each[:, :, k, 1:3].flatten(2)
-        features[f"{name}_velocity"] = of_each[:, :, k, 3:].flatten(2)
+
+    def one(k: int, name: str) -> dict[str, Tensor]:
+        return {
+            f"{name}_position": of_each[:, :, k, 0],
+            f"{name}_rotation": of_each[:, :, k, 1:3].flatten(2),
+            f"{name}_velocity": of_each[:, :, k, 3:].flatten(2),
+        }
+
+    features = one(agents - 1, "ball") | dict(field or {})
+    for k, name in enumerate(names):
+        features |= one(k, name)
     return features
 
 
@@ -165,6 +173,17 @@ def _places() -> tuple[float, ...]:
         for k in range(8):
             places += [radius * math.cos(k * math.pi / 4), radius * math.sin(k * math.pi / 4)]
     return tuple(places)
+
+
+def lying(view: View, memory: Memory, fallen: Tensor) -> Memory:
+    """Who lies, of who has ``fallen`` (N, A) and who lay before: ``down`` (N, A) steps since the
+    fall of who has not got up, ``falls`` (N, A) so far."""
+    fell_before = memory["down"] > 0
+    lies = fallen | (fell_before & (view.root_pos[..., 2] < UPRIGHT))
+    return {
+        "down": (memory["down"] + 1.0) * lies,
+        "falls": memory["falls"] + (fallen & ~fell_before),
+    }
 
 
 def get_up(

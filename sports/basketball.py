@@ -148,15 +148,12 @@ def features(view: View, memory: Memory) -> dict[str, Tensor]:
     goes = ball_games.attack(view)
     rims = torch.stack((_rims(view, -goes), _rims(view, goes)), 1)  # (A, 2, 3)
     own, other = view.heading.local(rims - view.root_pos[:, :, None]).unbind(2)
-    everything = ball_games.seen(view)
-    ball = {k: v for k, v in everything.items() if k.startswith("ball")}
-    others = {k: v for k, v in everything.items() if k not in ball}
-    return {**ball, "own_rim": own, "other_rim": other, **others}
+    return ball_games.seen(view, {"own_rim": own, "other_rim": other})
 
 
 def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
-    physics, root = view.physics, view.root_pos
+    physics = view.physics
     ball, velocity, before = physics.object_pos[:, 0], physics.object_linvel[:, 0], memory["ball"]
     goes = ball_games.attack(view)  # (A,)
     half = len(goes) // 2
@@ -193,12 +190,9 @@ def advance(view: View, memory: Memory) -> Advance:
     terms["basket"] = 10.0 * counted[:, None] * goes
 
     # Who lies too long is put on its feet, a ball off the court or stuck is dropped inside.
-    fallen, fell_before = view.fallen(), memory["down"] > 0
-    falls = memory["falls"] + (fallen & ~fell_before)
-    lies = fallen | (fell_before & (root[..., 2] < ball_games.UPRIGHT))
-    down = (memory["down"] + 1.0) * lies
+    laid = ball_games.lying(view, memory, view.fallen())
     edge = HALF_LENGTH - 2 * INSIDE, HALF_WIDTH - 2 * INSIDE
-    move, down, _ = ball_games.get_up(view, down, *edge)
+    move, down, _ = ball_games.get_up(view, laid["down"], *edge)
     still = (squared(velocity) < STILL_SPEED**2) & (ball[:, 2] > HIGH)
     still_steps = (memory["still_steps"] + 1.0).masked_fill(~still, 0.0)
     out = (ball[:, 0].abs() > HALF_LENGTH) | (ball[:, 1].abs() > HALF_WIDTH)
@@ -214,21 +208,21 @@ def advance(view: View, memory: Memory) -> Advance:
             "since_foot": since_foot,
             "foot": foot,
             "fouls": fouls,
+            **laid,
             "down": down,
-            "falls": falls,
             "came_up": came_up & ~out,
             "still_steps": still_steps.masked_fill(out, 0.0),
             **held,
         },
         terms=terms,
-        terminated=(scored != 0)[:, None].expand_as(fallen),
+        terminated=(scored != 0)[:, None].expand_as(fouled),
         metrics={
             "success": (counted > 0).float(),
             "baskets_for": (counted > 0).float(),
             "baskets_against": (counted < 0).float(),
             "possession": share,
             "fouls": fouls[:, :half].sum(1),
-            "falls": falls[:, :half].sum(1),
+            "falls": laid["falls"][:, :half].sum(1),
         },
         success=counted > 0,
         move=move,

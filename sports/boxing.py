@@ -8,17 +8,14 @@ ropes are solid, so that the rules need no bounds. Source: SMPLOlympics, section
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from sports import combat
 from sports.humanoid.body import Body, Shape
-from sports.physics.base import PhysicsState
-from sports.scene import Scene, SceneObject, Start
-from sports.task import Advance, Memory, Task, View
+from sports.scene import Scene, SceneObject
+from sports.task import Advance, Memory, Task, View, nothing_to_draw
 
 HALF_RING = 2.5
 ROPE_HEIGHTS, ROPE_RADIUS = (0.4, 0.8, 1.3), 0.02
@@ -79,14 +76,10 @@ def _ropes() -> tuple[SceneObject, ...]:
 
 def scene(config: Boxing, body: Body) -> Scene:
     """Two athletes on guard in a ring."""
-    half = combat.HALF_DISTANCE
     return Scene(
         name="boxing",
         body=body,
-        agents=(
-            Start(-half, pose=GUARD, z=GUARD_Z),
-            Start(half, yaw=math.pi, pose=GUARD, z=GUARD_Z),
-        ),
+        agents=combat.on_guard(GUARD, GUARD_Z),
         offset=GUARD,
         objects=_ropes(),
         contact_pairs=combat.contact_pairs(GLOVES),
@@ -94,17 +87,6 @@ def scene(config: Boxing, body: Body) -> Scene:
         rows_per_world=combat.ROWS,
         contacts_per_world=combat.CONTACTS,
     )
-
-
-def start(
-    view: View,
-    state: PhysicsState,
-    context: Memory,
-    generator: torch.Generator,
-    training: bool,
-) -> tuple[PhysicsState, Memory]:
-    """Nothing to draw."""
-    return state, {}
 
 
 def begin(view: View, context: Memory) -> Memory:
@@ -119,18 +101,14 @@ def features(view: View, memory: Memory) -> dict[str, Tensor]:
 
 def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
-    fell = view.fallen()
-    step = combat.advance(view, memory, GLOVES, fell)
-    mine, theirs = fell.float().unbind(1)
-    step.metrics.update({"fell": mine, "opponent_fell": theirs})
-    return step
+    return combat.advance(view, memory, GLOVES, {"fell": view.fallen()})
 
 
 TASK = Task(
     name="boxing",
     config=Boxing,
     scene=scene,
-    start=start,
+    start=nothing_to_draw,
     begin=begin,
     features=features,
     advance=advance,

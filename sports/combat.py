@@ -13,13 +13,16 @@ Shapes: N worlds, A = 2 athletes, B links, W weapons of each, K targets.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 
 import torch
 from torch import Tensor
 
 from sports.physics.base import GRAVITY
+from sports.scene import Start
 from sports.task import Advance, Memory, View, constant, squared
 
 TARGETS = ("Pelvis", "Torso", "Spine", "Chest", "Head")
@@ -61,6 +64,14 @@ def contact_pairs(weapons: tuple[Weapon, ...]) -> tuple[tuple[str, str], ...]:
         for a in range(2)
         for weapon in weapons
         for target in TARGETS
+    )
+
+
+def on_guard(pose: Mapping[str, float], z: float) -> tuple[Start, Start]:
+    """Two athletes who face each other in a pose, their roots at height ``z`` (m)."""
+    return (
+        Start(-HALF_DISTANCE, pose=pose, z=z),
+        Start(HALF_DISTANCE, yaw=math.pi, pose=pose, z=z),
     )
 
 
@@ -138,10 +149,13 @@ def begin(view: View, weapons: tuple[Weapon, ...]) -> Memory:
     return {"squares": squares, "wait": nobody.clone(), "touches": nobody.clone()}
 
 
-def advance(view: View, memory: Memory, weapons: tuple[Weapon, ...], faults: Tensor) -> Advance:
-    """One control step of a bout. ``faults`` (N, A): who ended it by a fall or by leaving; such an
-    athlete has lost, or whoever leads could end the bout by lying down. Otherwise, and where both
-    did, more touches win. Metrics are those of athlete 0; success is a bout it won.
+def advance(
+    view: View, memory: Memory, weapons: tuple[Weapon, ...], faults: Mapping[str, Tensor]
+) -> Advance:
+    """One control step of a bout. ``faults`` (N, A) by name: who ended it by a fall or by leaving;
+    such an athlete has lost, or whoever leads could end the bout by lying down. Otherwise, and
+    where both did, more touches win. Metrics are those of athlete 0, faults and the opponent's
+    faults among them; success is a bout it won.
     """
     squares = squared(gaps(view, weapons))
     # The force is the largest of the step's substeps, and the weapon may be off again at its end:
@@ -169,7 +183,8 @@ def advance(view: View, memory: Memory, weapons: tuple[Weapon, ...], faults: Ten
     }
 
     mine, theirs = touches.unbind(1)
-    lost, won = faults.unbind(1)
+    ended = reduce(torch.logical_or, faults.values())
+    lost, won = ended.unbind(1)
     margin = torch.where(lost == won, mine - theirs, won.float() - lost.float())
     win = margin > 0
     metrics = {
@@ -178,10 +193,12 @@ def advance(view: View, memory: Memory, weapons: tuple[Weapon, ...], faults: Ten
         "touches_for": mine,
         "touches_against": theirs,
     }
+    for name, fault in faults.items():
+        metrics[name], metrics[f"opponent_{name}"] = fault.float().unbind(1)
     return Advance(
         memory={"squares": squares, "wait": wait, "touches": touches},
         terms=terms,
-        terminated=faults,
+        terminated=ended,
         metrics=metrics,
         success=win,
     )

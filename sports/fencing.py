@@ -9,17 +9,14 @@ ends when somebody falls or leaves the piste with the root (who does so has lost
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from sports import combat
 from sports.humanoid.body import Body
-from sports.physics.base import PhysicsState
-from sports.scene import Scene, Start
-from sports.task import Advance, Memory, Task, View, constant
+from sports.scene import Scene
+from sports.task import Advance, Memory, Task, View, constant, nothing_to_draw
 
 HALF_LENGTH, HALF_WIDTH = 7.0, 1.0
 SWORD = (combat.Weapon("R_Hand", "R_Hand:1", 0.98),)
@@ -57,31 +54,16 @@ class Fencing:
 
 def scene(config: Fencing, body: Body) -> Scene:
     """Two athletes on guard on a plane."""
-    half = combat.HALF_DISTANCE
     return Scene(
         name="fencing",
         body=body,
-        agents=(
-            Start(-half, pose=GUARD, z=GUARD_Z),
-            Start(half, yaw=math.pi, pose=GUARD, z=GUARD_Z),
-        ),
+        agents=combat.on_guard(GUARD, GUARD_Z),
         offset=GUARD,
         contact_pairs=combat.contact_pairs(SWORD),
         link_contacts=True,
         rows_per_world=combat.ROWS,
         contacts_per_world=combat.CONTACTS,
     )
-
-
-def start(
-    view: View,
-    state: PhysicsState,
-    context: Memory,
-    generator: torch.Generator,
-    training: bool,
-) -> tuple[PhysicsState, Memory]:
-    """Nothing to draw."""
-    return state, {}
 
 
 def begin(view: View, context: Memory) -> Memory:
@@ -101,21 +83,16 @@ def features(view: View, memory: Memory) -> dict[str, Tensor]:
 
 def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
-    fell = view.fallen()
     x, y, _ = view.root_pos.unbind(-1)
     out = (x.abs() > HALF_LENGTH) | (y.abs() > HALF_WIDTH)
-    step = combat.advance(view, memory, SWORD, fell | out)
-    for name, what in (("fell", fell), ("out", out)):
-        mine, theirs = what.float().unbind(1)
-        step.metrics.update({name: mine, f"opponent_{name}": theirs})
-    return step
+    return combat.advance(view, memory, SWORD, {"fell": view.fallen(), "out": out})
 
 
 TASK = Task(
     name="fencing",
     config=Fencing,
     scene=scene,
-    start=start,
+    start=nothing_to_draw,
     begin=begin,
     features=features,
     advance=advance,

@@ -26,9 +26,18 @@ from sports import ball_games, quaternion
 from sports.hoop import RIM_HEIGHT, aim, crossing, hoop
 from sports.humanoid.body import Body
 from sports.humanoid.hold import BASKETBALL, load_hold
-from sports.physics.base import PhysicsState
 from sports.scene import GROUND, Scene
-from sports.task import Advance, Memory, Task, View, constant, length, nan_where, squared
+from sports.task import (
+    Advance,
+    Memory,
+    Task,
+    View,
+    constant,
+    length,
+    nan_where,
+    nothing_to_draw,
+    squared,
+)
 
 RIM = (4.5, 0.0, RIM_HEIGHT)
 LINE_X = 0.3
@@ -69,17 +78,6 @@ def scene(config: FreeThrow, body: Body) -> Scene:
         substeps=8,
         sites={"spot": (0.0, 0.0, 0.0), "line": (LINE_X, 0.0, 0.0)},
     )
-
-
-def start(
-    view: View,
-    state: PhysicsState,
-    context: Memory,
-    generator: torch.Generator,
-    training: bool,
-) -> tuple[PhysicsState, Memory]:
-    """Nothing to draw: the scene starts in the hold."""
-    return state, {}
 
 
 def begin(view: View, context: Memory) -> Memory:
@@ -211,7 +209,7 @@ TASK = Task(
     name="free_throw",
     config=FreeThrow,
     scene=scene,
-    start=start,
+    start=nothing_to_draw,
     begin=begin,
     features=features,
     advance=advance,

@@ -25,9 +25,19 @@ from torch import Tensor
 from sports import quaternion
 from sports.humanoid.body import Body
 from sports.humanoid.hold import JAVELIN, JAVELIN_LENGTH, JAVELIN_RADIUS, NOSE_UP, load_hold
-from sports.physics.base import GRAVITY, PhysicsState
+from sports.physics.base import GRAVITY
 from sports.scene import GROUND, Scene
-from sports.task import Advance, Memory, Task, View, constant, length, nan_where, squared
+from sports.task import (
+    Advance,
+    Memory,
+    Task,
+    View,
+    constant,
+    length,
+    nan_where,
+    nothing_to_draw,
+    squared,
+)
 
 LINE_X, HALF_FIELD = 2.0, 2.0
 """Foul line, and how far from the start the root may be along x and y (m)."""
@@ -67,17 +77,6 @@ def scene(config: Javelin, body: Body) -> Scene:
         substeps=8,
         sites={"start": (0.0, 0.0, 0.0)},
     )
-
-
-def start(
-    view: View,
-    state: PhysicsState,
-    context: Memory,
-    generator: torch.Generator,
-    training: bool,
-) -> tuple[PhysicsState, Memory]:
-    """Nothing to draw: the scene starts in the hold."""
-    return state, {}
 
 
 def begin(view: View, context: Memory) -> Memory:
@@ -251,7 +250,7 @@ TASK = Task(
     name="javelin",
     config=Javelin,
     scene=scene,
-    start=start,
+    start=nothing_to_draw,
     begin=begin,
     features=features,
     advance=advance,

@@ -17,9 +17,19 @@ import torch
 from torch import Tensor
 
 from sports.humanoid.body import Body
-from sports.physics.base import GRAVITY, Marks, PhysicsState
+from sports.physics.base import GRAVITY, Marks
 from sports.scene import Scene
-from sports.task import Advance, Memory, Task, View, clamp01, constant, nan_where, progress
+from sports.task import (
+    Advance,
+    Memory,
+    Task,
+    View,
+    clamp01,
+    constant,
+    nan_where,
+    nothing_to_draw,
+    progress,
+)
 from sports.task import length as magnitude
 
 LINE_X = 20.0
@@ -44,17 +54,6 @@ def scene(config: LongJump, body: Body) -> Scene:
         body=body,
         sites={"start": START, "line": LINE, "goal": GOAL},
     )
-
-
-def start(
-    view: View,
-    state: PhysicsState,
-    context: Memory,
-    generator: torch.Generator,
-    training: bool,
-) -> tuple[PhysicsState, Memory]:
-    """Nothing to draw."""
-    return state, {}
 
 
 def begin(view: View, context: Memory) -> Memory:
@@ -175,7 +174,7 @@ TASK = Task(
     name="long_jump",
     config=LongJump,
     scene=scene,
-    start=start,
+    start=nothing_to_draw,
     begin=begin,
     features=features,
     advance=advance,

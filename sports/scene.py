@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -285,6 +286,11 @@ class Scene:
         for o in self.free_objects:
             qpos[self.object_qpos(o.name)] = (*o.pos, *o.quat)
         return qpos
+
+    @cached_property
+    def start_qpos(self) -> tuple[float, ...]:
+        """``default_qpos`` worked out once, for what asks in every step."""
+        return tuple(self.default_qpos().tolist())
 
     def default_mocap_pos(self) -> np.ndarray:
         """(M, 3) positions of the mocap objects."""

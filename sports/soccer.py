@@ -216,10 +216,8 @@ def begin(view: View, context: Memory) -> Memory:
 def features(view: View, memory: Memory) -> dict[str, Tensor]:
     """The ball, both goals (the own one first) and the others as each athlete sees them."""
     goes = ball_games.attack(view)
-    everything = ball_games.seen(view)
-    ball = {k: v for k, v in everything.items() if k.startswith("ball")}
     goals = {"own_goal": goal_posts(view, -goes), "other_goal": goal_posts(view, goes)}
-    return {**ball, **goals, **{k: v for k, v in everything.items() if k not in ball}}
+    return ball_games.seen(view, goals)
 
 
 def advance(view: View, memory: Memory) -> Advance:
@@ -258,12 +256,9 @@ def advance(view: View, memory: Memory) -> Advance:
 
     # Who lies too long is put on its feet, a ball over a wall is dropped inside.
     fallen = view.fallen()
-    fell_before = memory["down"] > 0
-    falls = memory["falls"] + (fallen & ~fell_before)
-    lies = fallen | (fell_before & (root[..., 2] < ball_games.UPRIGHT))
-    down = (memory["down"] + 1.0) * lies
+    laid = ball_games.lying(view, memory, fallen)
     edge = HALF_LENGTH - 1.0, HALF_WIDTH - 1.0
-    move, down, root_after = ball_games.get_up(view, down, *edge)
+    move, down, root_after = ball_games.get_up(view, laid["down"], *edge)
     x, y, z = ball.unbind(-1)
     beyond = torch.maximum(x.abs() - HALF_LENGTH, y.abs() - HALF_WIDTH)
     outside = (beyond > OVER_WALL) | ((beyond > 0.0) & (z > WALL_HEIGHT))
@@ -283,8 +278,8 @@ def advance(view: View, memory: Memory) -> Advance:
             "since_handling": since_handling,
             "handling": handling,
             "handled": handled,
+            **laid,
             "down": down,
-            "falls": falls,
             **held,
         },
         terms=terms,
@@ -294,7 +289,7 @@ def advance(view: View, memory: Memory) -> Advance:
             "goals_for": (counted > 0).float(),
             "goals_against": (counted < 0).float(),
             "possession": share,
-            "falls": falls[:, :half].sum(1),
+            "falls": laid["falls"][:, :half].sum(1),
             "handling": handled[:, :half].sum(1),
         },
         success=counted > 0,

@@ -176,6 +176,24 @@ class Task:
     notes: Mapping[str, str] = field(default_factory=dict)
 
 
+def nothing_to_draw(
+    view: View,
+    state: PhysicsState,
+    context: Memory,
+    generator: torch.Generator,
+    training: bool,
+) -> tuple[PhysicsState, Memory]:
+    """``Task.start`` of a sport whose scene is its start."""
+    return state, {}
+
+
+def _changed(view: View, onto: Move | None) -> tuple[Tensor, Tensor]:
+    """qpos and qvel to write to: those of what else moves, else copies of the present ones."""
+    if onto is not None:
+        return onto.qpos, onto.qvel
+    return view.physics.qpos.clone(), view.physics.qvel.clone()
+
+
 def place_object(
     view: View,
     mask: Tensor,
@@ -191,10 +209,9 @@ def place_object(
     ``pos``, ``linvel`` (N, 3) world frame; ``quat`` (N, 4), upright by default; ``angvel`` (N, 3)
     in the object's own frame, zero by default. ``onto``: what else moves.
     """
-    physics, scene = view.physics, view.physics.scene
+    scene = view.physics.scene
     q, v = scene.object_qpos(name), scene.object_qvel(name)
-    qpos = onto.qpos if onto is not None else physics.qpos.clone()
-    qvel = onto.qvel if onto is not None else physics.qvel.clone()
+    qpos, qvel = _changed(view, onto)
     if quat is None:
         quat = constant((1.0, 0.0, 0.0, 0.0), pos.device).expand(len(pos), 4)
     spin = torch.zeros_like(linvel) if angvel is None else angvel
@@ -215,11 +232,10 @@ def place_athlete(
 ) -> Move:
     """Puts an athlete on its feet, at rest in its start pose, where ``mask`` (N,) is true: at
     ``x``, ``y`` (N,), facing ``yaw`` (N,) about +z (rad). ``onto``: what else moves."""
-    physics, scene = view.physics, view.physics.scene
+    scene = view.physics.scene
     q, v = scene.agent_qpos(agent), scene.agent_qvel(agent)
-    qpos = onto.qpos if onto is not None else physics.qpos.clone()
-    qvel = onto.qvel if onto is not None else physics.qvel.clone()
-    pose = constant(tuple(scene.default_qpos()[q].tolist()), x.device)
+    qpos, qvel = _changed(view, onto)
+    pose = constant(scene.start_qpos[q], x.device)
     zero = torch.zeros_like(x)
     root = torch.stack(
         (x, y, zero + pose[2], (0.5 * yaw).cos(), zero, zero, (0.5 * yaw).sin()), dim=-1
