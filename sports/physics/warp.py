@@ -22,6 +22,7 @@ from sports.physics import warp_kernels as kernels
 from sports.physics.base import Geometry, PhysicsState, diverged
 from sports.physics.game import build_game, has_game
 from sports.physics.variation import Draw, Variation, contact_softness, draw
+from sports.physics.warp_factor import faster, pieces
 from sports.scene import Scene
 
 ITERATIONS, LINE_SEARCH = 5, 8
@@ -88,6 +89,7 @@ class WarpPhysics:
         contacts = scene.contacts_per_world or 40 + solid // 2
         with wp.ScopedDevice(self._wp_device):
             self.m = mjw.put_model(model)
+            self._pieces = pieces(model)
             self.m.opt.warn_overflow = 0  # counted below, never printed
             self.d = mjw.make_data(model, nworld=n, nconmax=contacts, njmax=rows)
             self._timesteps = [self.m.opt.timestep] * scene.substeps
@@ -304,7 +306,8 @@ class WarpPhysics:
         for i in range(self.scene.substeps):
             self.m.opt.timestep = self._timesteps[i]
             self._ask_law("push_worlds", self._timesteps[i])
-            mjw.step(self.m, d)
+            with faster(self._pieces):
+                mjw.step(self.m, d)
             mjw.contact_force(self.m, d, self._contact_ids, True, self._contact_force)
             wp.launch(
                 kernels.sum_contacts,
