@@ -54,14 +54,14 @@ DOWN_Z = -0.1
 THROUGH = 0.10
 """Nothing but an arm passes a hurdle's plane this far below its top (m)."""
 
-# The curriculum: heights U(0, h_max). A finish over a hurdle near h_max raises it.
+# The curriculum: heights U(0, h_max). A hurdle near h_max that was cleared raises it.
 LEAST_MAX, MOST_MAX, RAISE = 0.3, 1.167, 0.15
 RACES = 0.1
 """Share of training episodes that are the race itself. Without them a policy whose curriculum had
 come to 0.32 m (PPO, 29 M samples: 37 m a race) had never seen a hurdle of 1.067 m: its normalised
 observations lay at their bounds, and it fell over at the start."""
 PROOF = 0.8
-"""Share of h_max that the highest hurdle must have had for a finish to count."""
+"""Share of h_max that the highest hurdle cleared must have had to count."""
 
 # A hurdle that topples: a closed board, so that nobody crawls under it, on two rails that point
 # towards the runner, with weights on them that are moved so that the force below overturns it.
@@ -169,11 +169,12 @@ def curriculum(config: Hurdling, num_worlds: int, device: torch.device) -> Memor
 
 
 def promote(view: View, memory: Memory, step: Advance, ended: Tensor) -> Memory:
-    """Higher hurdles for a world that reached the finish over one near its height; from wherever
-    the athlete started standing: a demonstration is no proof."""
+    """Higher hurdles for a world whose athlete cleared one near its height and ran on to the next
+    hurdle or the finish, from wherever it started standing: a demonstration is no proof. Asked for
+    the finish as well, which three in four do not reach, heights rose from 0.3 to 0.6 m in 43 M
+    samples of PPO."""
     h_max = view.curriculum["h_max"]
-    proven = memory["highest"] >= PROOF * h_max
-    up = ended & step.success & proven & memory["standing"]
+    up = ended & (memory["highest"] >= PROOF * h_max) & memory["standing"]
     return {"h_max": (h_max + RAISE * up).clamp(max=MOST_MAX)}
 
 
@@ -237,6 +238,7 @@ def begin(view: View, context: Memory) -> Memory:
         "given": torch.maximum(behind[:, 0], context["first"]),
         "x_max": root[:, 0].clone(),
         "passed": behind[:, 0].clone(),
+        "over": zero.clone(),
         "highest": zero.clone(),
         "finished": zero.bool(),
         "time": torch.full_like(zero, torch.nan),
@@ -288,7 +290,10 @@ def advance(view: View, memory: Memory) -> Advance:
 
     x_max = torch.maximum(memory["x_max"], x)
     passed = torch.maximum(memory["passed"], behind[:, 0])
-    over = height[:, 0].masked_fill(passed == memory["passed"], 0.0)
+    # A hurdle is cleared when the next one is reached, or the finish.
+    further = passed != memory["passed"]
+    cleared = memory["over"].masked_fill(~(further | arrives), 0.0)
+    over = torch.where(further, height[:, 0], memory["over"])
     success = finished.float()
     top_speed = torch.maximum(memory["top_speed"], view.root_linvel[:, 0, 0])
     metrics = {
@@ -307,7 +312,8 @@ def advance(view: View, memory: Memory) -> Advance:
         "behind": behind,
         "x_max": x_max,
         "passed": passed,
-        "highest": torch.maximum(memory["highest"], over),
+        "over": over,
+        "highest": torch.maximum(memory["highest"], cleared),
         "finished": finished,
         "time": time,
         "top_speed": top_speed,

@@ -120,6 +120,26 @@ def solid(obj: SceneObject, restitution: float) -> Surface:
     return Surface(obj.name, "box", obj.pos, box.size, quat=obj.quat, restitution=restitution)
 
 
+def leaning_pairs(fixtures: tuple[SceneObject, ...], agents: int) -> tuple[tuple[str, str], ...]:
+    """Contact pairs of :func:`leaning`: each athlete, and the hand with its racket, on each of
+    the table and the nets."""
+    return tuple(
+        (side, part.name)
+        for agent in range(agents)
+        for part in fixtures
+        for side in (f"agent{agent}", f"agent{agent}/{WRIST}/")
+    )
+
+
+def leaning(view: View) -> Tensor:
+    """(N, A) bool: an athlete touches table or net with more than the hand that holds the racket,
+    which may lie on a table; it must not be leant on. Source: ITTF laws 2.10.1.8 to 2.10.1.10 (the
+    playing surface moved, the net assembly, the free hand), ITF rule 24 (the net). PPO fell on the
+    table after every stroke and lay there."""
+    whole, hand = view.physics.pair_force.unflatten(1, (view.root_pos.shape[1], -1, 2)).unbind(-1)
+    return ((whole - hand).abs() > 1e-3 * whole).any(-1)
+
+
 # Starts and launches.
 
 

@@ -5,11 +5,11 @@ bounce in the other half of the court (anywhere else it is out; a ball that meet
 and is out when it comes down on the wrong side); the other side must then hit it before it bounces
 again. A stroke is a foul if the same side hit the ball last, if it meets the ball beyond the net,
 or, where volleys are not allowed, before the ball has bounced. A point is also lost by a side whose
-athlete falls, crosses the net or is met by the ball; and when the ball leaves the space of play or
-stops (on the net), by the receiver after a good bounce, else by the side that hit it. Let balls are
-played on. Two impacts on a racket within a control step (33 ms) are one stroke, as the rules have
-it of a ball hit twice in one swing; a contact in a later step is a second one. Source: ITF rules of
-tennis 12, 24 and 25; ITTF laws of table tennis 2.7 and 2.10.
+athlete falls, crosses the net, leans on table or net or is met by the ball; and when the ball
+leaves the space of play or stops (on the net), by the receiver after a good bounce, else by the
+side that hit it. Let balls are played on. Two impacts on a racket within a control step (33 ms) are
+one stroke, as the rules have it of a ball hit twice in one swing; a contact in a later step is a
+second one. Source: ITF rules of tennis 12, 24 and 25; ITTF laws of table tennis 2.7 and 2.10.
 
 Sides are +1 (the half x > 0, agent 0) and -1 (agent 1, or the machine of the tasks with one
 athlete). Within a control step impacts are taken in the order of their times. World frame, m, s.

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from sports.ball import crossing, landing
-from sports.rackets import HAND, Game, aims, racket_pos, served
+from sports.rackets import HAND, Game, aims, leaning, racket_pos, served
 from sports.rally import SIDES, Point, Touches, met, play, touches
 from sports.task import Advance, Memory, View, constant, nan_where, place_object, squared
 
@@ -54,7 +54,7 @@ def judge(game: Game, view: View, memory: Memory, sharpness: float) -> Stroke:
     way = torch.stack((memory["ball"], _corner(touch, ball), ball), 1)
     bumped = met(view, way, BODY_DISTANCE, HAND)
     trespassed = view.root_pos[..., 0] * sides < 0
-    late = bumped | trespassed | view.fallen()
+    late = bumped | trespassed | leaning(view) | view.fallen()
     before = memory["hitter"], memory["bounced"]
     point = play(game.court, *before, touch, ball, linvel, late)
 

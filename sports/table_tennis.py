@@ -117,6 +117,7 @@ def scene(config: TableTennis, body: Body, agents: int = 1) -> Scene:
         body=body,
         agents=rackets.players(GAME, agents),
         objects=(rackets.ball(GAME), board, net),
+        contact_pairs=rackets.leaning_pairs((board, net), agents),
         surfaces=(
             Surface("table", "box", center=board.pos, size=board.shapes[0].size),
             Surface("ground", "plane"),

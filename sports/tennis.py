@@ -137,6 +137,7 @@ def scene(config: Tennis, body: Body, agents: int = 1) -> Scene:
         body=body,
         agents=rackets.players(rules, agents),
         objects=(rackets.ball(rules), *nets),
+        contact_pairs=rackets.leaning_pairs(nets, agents),
         surfaces=(
             Surface("ground", "plane"),
             *(rackets.solid(part, restitution=NET_RESTITUTION) for part in nets),

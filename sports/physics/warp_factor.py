@@ -10,7 +10,8 @@
   with half a million blocks of threads that mostly have nothing to do (13 %). Here a block takes a
   world.
 
-What depends on MuJoCo Warp's inner names is in this module; without them its own pieces stay.
+This module alone depends on MuJoCo Warp's inner names (4.0); ``tests/sports/test_warp_factor.py``
+says whether another version still has them.
 """
 
 from __future__ import annotations
@@ -37,42 +38,62 @@ MANY = int(solver._SPARSE_BLOCK_CHOLESKY_DIM)
 _FACTOR = """
 #if defined(__CUDA_ARCH__)
     __shared__ float rows[SIZE];
-    __shared__ unsigned short targets[SIZE];
+    __shared__ unsigned short targets[SIZE], starts[DOFS + 1];
 #else
     float rows[SIZE];
-    unsigned short targets[SIZE];
+    unsigned short targets[SIZE], starts[DOFS + 1];
 #endif
-    const int first = tree[0], last = tree[1], base = begin.data[first];
-    const int size = begin.data[last] + length.data[last] - base;
-    const float* source = (const float*)((const char*)inertia.data + (size_t)w * inertia.strides[0]);
-    float* result = (float*)((char*)factor.data + (size_t)w * factor.strides[0]);
-    float* inverses = (float*)((char*)diagonal.data + (size_t)w * diagonal.strides[0]);
+    const int first = tree[0], dofs = tree[1] - first + 1, base = begin.data[first];
+    const int size = begin.data[tree[1]] + length.data[tree[1]] - base;
+    const size_t world = w;
+    const float* source = (const float*)((const char*)inertia.data + world * inertia.strides[0]);
+    float* result = (float*)((char*)factor.data + world * factor.strides[0]);
+    float* inverses = (float*)((char*)diagonal.data + world * diagonal.strides[0]);
     for (int e = lane; e < size; e += lanes) {
         rows[e] = source[base + e];
         targets[e] = (unsigned short)(begin.data[column.data[base + e]] - base);
     }
+    for (int k = lane; k < dofs; k += lanes)
+        starts[k] = (unsigned short)(begin.data[first + k] - base);
+    if (lane == 0)
+        starts[dofs] = (unsigned short)size;
     WP_TILE_SYNC();
-    const int width = lanes < 32 ? lanes : 32;
-    const int high = lane / width, across = lane % width, stride = lanes / width;
-    for (int k = last; k >= first; --k) {
-        const int row = begin.data[k] - base, ancestors = length.data[k] - 1;
+    const int width = lanes < 32 ? lanes : 32, stride = lanes / width;
+    const int high = lane / width, across = lane % width;
+    for (int k = dofs - 1; k >= 0; --k) {
+        const int row = starts[k], ancestors = starts[k + 1] - row - 1;
         const float scale = 1.0f / rows[row + ancestors];
-        for (int a = high; a < ancestors; a += stride) {
-            const float share = rows[row + a] * scale;
-            float* target = rows + targets[row + a];
-            for (int b = across; b <= a; b += width)
-                target[b] -= share * rows[row + b];
+        for (int b = across; b < ancestors; b += width) {
+            const float share = rows[row + b] * scale;
+            // All lanes of a row of 32 go through the same rows a >= b, four of them at a time.
+            const int skipped = (b - across - high + stride - 1) / stride;
+            const int start = high + (skipped > 0 ? skipped : 0) * stride;
+            for (int a = start; a < ancestors; a += 4 * stride) {
+                float value[4];
+                int place[4];
+#pragma unroll
+                for (int j = 0; j < 4; ++j) {
+                    const int c = a + j * stride;
+                    place[j] = c >= b && c < ancestors ? targets[row + c] + b : -1;
+                    if (place[j] >= 0)
+                        value[j] = rows[place[j]] - share * rows[row + c];
+                }
+#pragma unroll
+                for (int j = 0; j < 4; ++j)
+                    if (place[j] >= 0)
+                        rows[place[j]] = value[j];
+            }
         }
         WP_TILE_SYNC();
     }
-    for (int k = first + high; k <= last; k += stride) {
-        const int row = begin.data[k] - base, ancestors = length.data[k] - 1;
+    for (int k = high; k < dofs; k += stride) {
+        const int row = starts[k], ancestors = starts[k + 1] - row - 1;
         const float pivot = rows[row + ancestors], scale = 1.0f / pivot;
         for (int a = across; a < ancestors; a += width)
             result[base + row + a] = rows[row + a] * scale;
         if (across == 0) {
             result[base + row + ancestors] = pivot;
-            inverses[k] = scale;
+            inverses[first + k] = scale;
         }
     }
     WP_TILE_SYNC();
@@ -80,11 +101,11 @@ _FACTOR = """
 
 
 @cache
-def factor_kernel(size: int) -> wp.Kernel:
-    """L and 1/D of the inertia of trees with at most ``size`` entries: a row for each degree of
-    freedom, a column for each of its ancestors and itself."""
+def factor_kernel(size: int, dofs: int) -> wp.Kernel:
+    """L and 1/D of the inertia of trees with at most ``size`` entries: a row for each of at most
+    ``dofs`` degrees of freedom, a column for each of its ancestors and itself."""
 
-    @wp.func_native(snippet=_FACTOR.replace("SIZE", str(size)))
+    @wp.func_native(snippet=_FACTOR.replace("SIZE", str(size)).replace("DOFS", str(dofs)))
     def factor_tree(
         w: int,
         lane: int,
@@ -110,9 +131,7 @@ def factor_kernel(size: int) -> wp.Kernel:
     ):
         w, t, lane = wp.tid()
         lanes = wp.block_dim()
-        factor_tree(
-            w, lane, lanes, trees[t], length, begin, column, inertia, factor, diagonal
-        )
+        factor_tree(w, lane, lanes, trees[t], length, begin, column, inertia, factor, diagonal)
 
     return factor_trees
 
@@ -165,12 +184,14 @@ class Pieces:
     """(T,) first and last degree of freedom of the trees that are factored here."""
     size: int
     """Entries of the inertia of the largest one."""
+    dofs: int
+    """Its degrees of freedom."""
 
     def factor(self, m: Any, d: Any, M: wp.array, L: wp.array, D: wp.array) -> None:
         """In place of ``smooth._factor_i_sparse``."""
         lanes = LANES if wp.get_device().is_cuda else 1
         wp.launch(
-            factor_kernel(self.size),
+            factor_kernel(self.size, self.dofs),
             dim=(d.nworld, self.trees.shape[0], lanes),
             inputs=[self.trees, m.M_rownnz, m.M_rowadr, m.M_colind, M],
             outputs=[L, D],
@@ -186,7 +207,10 @@ def pieces(model: mujoco.MjModel) -> Pieces:
     entry = np.asarray(model.M_rowadr), np.asarray(model.M_rownnz)
     sizes = [entry[0][last[t]] + entry[1][last[t]] - entry[0][starts[t]] for t in large]
     trees = np.stack((starts[large], last[large]), 1).astype(np.int32)
-    return Pieces(wp.array(trees, dtype=wp.vec2i), int(max(sizes, default=0)))
+    dofs = trees[:, 1] - trees[:, 0] + 1
+    return Pieces(
+        wp.array(trees, dtype=wp.vec2i), int(max(sizes, default=0)), int(dofs.max(initial=0))
+    )
 
 
 def find_tiles(m: Any, d: Any, ctx: Any, skip_unchanged: bool, skip_noflip: bool) -> None:

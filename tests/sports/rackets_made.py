@@ -24,6 +24,7 @@ class HandMadeRally(HandMade):
     def __init__(self, task: str, num_worlds: int = 1, **options: object) -> None:
         super().__init__(task, num_worlds, **options)
         self.scene = self.env.physics.scene
+        self._lean = torch.zeros(())
         self._clean = self.state.clone()
         self.quiet()
 
@@ -65,6 +66,11 @@ class HandMadeRally(HandMade):
         physics.ball_hit_time[:, s] = time
         physics.ball_hit_pos[:, s] = torch.tensor(pos)
 
+    def lean(self, forces: Sequence[float]) -> None:
+        """Contact forces (N) of the next step: of each athlete the whole and the racket's hand, on
+        each of table and nets."""
+        self._lean = torch.tensor(forces, dtype=torch.float32)
+
     def go(
         self,
         pos: Sequence[float],
@@ -77,6 +83,8 @@ class HandMadeRally(HandMade):
         physics = self.env.physics
         for link, newtons in (forces or {}).items():
             physics.ground_force[:, 0, physics.scene.body.link_index(link), 2] = newtons
+        physics.pair_force[:] = self._lean
+        self._lean = torch.zeros(())
         self.env.view.clock = self.env.view.clock + 1
         step = self.env.task.advance(self.env.view, self.env.memory)
         self.env.memory = step.memory

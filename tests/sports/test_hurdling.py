@@ -231,27 +231,27 @@ def test_a_demonstration_starts_where_it_is():
     assert (context["first"][[0, 2]] == 0.0).all()
 
 
-def test_a_finish_over_a_high_hurdle_raises_the_next_ones():
+def test_a_high_hurdle_that_was_cleared_raises_the_next_ones():
     world = HandMade("hurdling", num_worlds=6)
     world.place((109.0, 0.0, STANDING))
     world.begin()
     env = world.env
     env.view.curriculum = {"h_max": torch.tensor([0.5, 0.5, 0.5, 0.5, 1.1, 1.167])}
     step = world.advance()
-    step.success = torch.tensor([True, True, True, False, True, True])
+    step.success = torch.tensor([True, True, True, False, True, True])  # decides nothing
     env.memory["highest"] = torch.tensor([0.41, 0.39, 0.5, 0.5, 1.0, 1.0])
     env.memory["standing"] = torch.tensor([True, True, False, True, True, True])
     everyone = torch.ones(6, dtype=torch.bool)
     assert env.task.promote is not None
     raised = env.task.promote(env.view, env.memory, step, everyone)["h_max"]
-    # Proven; too low; a demonstration; no finish; up to the most; there already.
-    expected = torch.tensor([0.65, 0.5, 0.5, 0.5, MOST_MAX, MOST_MAX])
+    # Proven; too low; a demonstration; proven; up to the most; there already.
+    expected = torch.tensor([0.65, 0.5, 0.5, 0.65, MOST_MAX, MOST_MAX])
     torch.testing.assert_close(raised, expected)
     kept = env.task.promote(env.view, env.memory, step, ~everyone)["h_max"]
     assert torch.equal(kept, env.view.curriculum["h_max"])
 
 
-def test_the_highest_hurdle_is_one_that_was_passed():
+def test_a_hurdle_is_cleared_when_the_next_one_is_reached():
     world = at(13.0, z=HIGH)
     heights = torch.tensor([0.4, 0.7, 0.6, 1.0, 0, 0, 0, 0, 0, 0])
     world.env.memory["marks"][:, :10, 2] = heights
@@ -260,8 +260,19 @@ def test_the_highest_hurdle_is_one_that_was_passed():
         world.place((x, 0.0, HIGH))
         step = world.advance()
         seen.append((float(world.env.memory["highest"][0]), float(step.metrics["hurdles"][0])))
-    expected = [(0.4, 1), (0.4, 1), (0.7, 2), (0.7, 3), (0.7, 3), (0.7, 3)]
+    expected = [(0.0, 1), (0.0, 1), (0.4, 2), (0.7, 3), (0.7, 3), (0.7, 3)]
     assert seen == [(pytest.approx(h), n) for h, n in expected]
+
+
+def test_the_last_hurdle_is_cleared_at_the_finish():
+    world = at(95.0, z=HIGH)
+    world.env.memory["marks"][:, :10, 2] = 0.8
+    seen = []
+    for x in (97.0, 109.9, 110.1):
+        world.place((x, 0.0, HIGH))
+        world.advance()
+        seen.append(float(world.env.memory["highest"][0]))
+    assert seen == [0.0, 0.0, pytest.approx(0.8)]
 
 
 def thrown(speeds: list[float], z: float, **options: Any):

@@ -246,6 +246,58 @@ def test_the_ball_must_not_meet_the_body():
         assert far(world.go((1.9, y, 1.0), (9.0, 0.0, 0.0))) is lost
 
 
+@pytest.mark.parametrize(
+    ("forces", "lost"),
+    [
+        ((0, 0, 0, 0), False),
+        ((30, 30, 0, 0), False),  # the hand with the paddle, alone on the table
+        ((30, 0, 0, 0), True),
+        ((30, 12, 0, 0), True),  # something else besides
+        ((0, 0, 5, 5), False),
+        ((0, 0, 5, 0), True),  # the net
+    ],
+)
+def test_table_and_net_are_not_leant_on(forces, lost):
+    world = rally()
+    world.lean(forces)
+    assert far(world.go((0.95, 0.2, 0.95), (3.5, 0.0, 1.2))) is lost
+
+
+def test_of_two_athletes_the_one_who_leans_loses_the_point():
+    for agent in range(2):
+        world = made("table_tennis_1v1")
+        world.put_ball((0.0, 0.0, 1.4), (-2.5, 0.0, 0.0))
+        world.start()
+        forces = [0.0] * 8
+        forces[4 * agent] = 20.0
+        world.lean(forces)
+        step = world.go((-0.1, 0.0, 1.4), (-2.5, 0.0, -0.3))
+        won = step.metrics["points_for" if agent else "points_against"]
+        assert step.terminated.all() and won[0] == 1.0
+
+
+def test_whoever_lies_on_the_table_leans_on_it():
+    """In the engine: a trunk on the table, and a paddle alone that is pressed on it."""
+    bent = {"L_Hip_y": -1.4, "R_Hip_y": -1.4}
+    world = made("table_tennis")
+    table = world.scene.contact_pairs.index(("agent0", "table"))
+
+    def pressed(height: float, x: float, **joints: float) -> tuple[bool, bool]:
+        world.restore()
+        world.place((x, 0.0, height), **joints)
+        world.start()
+        touching = leaning = False
+        for _ in range(12):
+            world.env.physics.step(world.env.targets(torch.zeros(1, 1, 69)).flatten(1))
+            world.env.view.refresh()
+            touching |= bool(world.env.physics.pair_force[0, table] > 0.0)
+            leaning |= bool(rackets.leaning(world.env.view)[0, 0])
+        return touching, leaning
+
+    assert pressed(0.95, 1.55, **bent) == (True, True)
+    assert pressed(0.95, 2.2) == (False, False)
+
+
 def test_features_are_seen_from_the_athlete():
     world = rally(ball_path=True)
     world.go((0.5, 0.3, 1.0), (4.0, 0.5, 1.0))
