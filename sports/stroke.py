@@ -7,6 +7,7 @@ worlds, A agents.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -21,6 +22,8 @@ BODY_DISTANCE = 0.15
 """A ball nearer than this (m) to a link has met the body."""
 LONGEST = 3.0
 """Flights of returns are followed for so long (s)."""
+REACHABLE = 4.0
+"""A racket further than this (m) from the ball is as good as this far."""
 
 
 @dataclass
@@ -74,6 +77,22 @@ def judge(game: Game, view: View, memory: Memory, sharpness: float) -> Stroke:
         landed=landed & has_struck,
         returns=memory["returns"],
     )
+
+
+def check_reach(reach: float) -> None:
+    """Raises ValueError for an option that would pay for keeping away from the ball."""
+    if reach < 0.0:
+        raise ValueError(f"the reward for reaching must not be negative: {reach}")
+
+
+def nearer(memory: Memory, stroke: Stroke, sharpness: float) -> Tensor:
+    """(N, A) metres by which a racket has come nearer than ever to the ball on its way, within
+    ``REACHABLE``. Unlike exp(-sharpness d^2) it says where to go from afar."""
+    before = memory["nearest"]
+    best = torch.maximum(before, stroke.near)
+    least = math.exp(-sharpness * REACHABLE**2)
+    far, near = ((-x.clamp(least, 1.0).log() / sharpness).sqrt() for x in (before, best))
+    return far - near
 
 
 def _corner(touch: Touches, ball: Tensor) -> Tensor:

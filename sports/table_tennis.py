@@ -85,6 +85,12 @@ class TableTennis:
     """Pay how near racket and ball are in every step before a stroke, as the paper does. False: pay
     only what is nearer than ever to this ball. Following the ball with the paddle to its second
     bounce earns more than risking a stroke (PPO, 24 M samples)."""
+    reach: float = 0.0
+    """Reward for each metre, of the last 4, by which the paddle has come nearer to this ball than
+    ever before; 0 for the paper's terms alone."""
+
+    def __post_init__(self) -> None:
+        stroke.check_reach(self.reach)
 
 
 def table() -> SceneObject:
@@ -152,6 +158,8 @@ def advance(view: View, memory: Memory) -> Advance:
         "approach": now.near if view.config.shadow else now.closer,
         "landing": worth * now.promising,
     }
+    if view.config.reach > 0.0:
+        terms["reach"] = view.config.reach * stroke.nearer(memory, now, SHARPNESS)
     return stroke.conclude(GAME, view, memory, now, terms)
 
 

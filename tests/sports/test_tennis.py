@@ -60,6 +60,24 @@ def test_before_contact_the_racket_is_led_to_the_ball():
         assert step.terms["landing"][0, 0] == 0.0 and step.terms["bounce"][0, 0] == 0.0
 
 
+def test_reaching_is_paid_by_the_metre_and_once():
+    """Of the last four metres, whatever the way; a stroke and a new ball begin anew."""
+    world = rally(reach=2.0)
+    racket = (13.0 - RACKET[0], -RACKET[1], STANDING + RACKET[2])
+    world.env.memory["nearest"] *= 0.0  # the bounce of ``rally`` was within 4 m already
+    paid = []
+    for d in (5.0, 3.0, 1.0, 2.0, 1.0, 0.5):
+        step = world.go((racket[0] - d, racket[1], racket[2]), (0.0, 0.0, -1.0))
+        paid.append(float(step.terms["reach"][0, 0]))
+    assert paid == pytest.approx([0.0, 2.0, 4.0, 0.0, 0.0, 1.0], abs=4e-3)
+    assert stroke(world).terms["reach"][0, 0] == 0.0
+    assert world.env.memory["nearest"][0, 0] == 0.0
+    assert "reach" not in rally().go((11.0, 0.0, 1.0)).terms
+    for sport in ("tennis", "table_tennis"):
+        with pytest.raises(ValueError, match="must not be negative"):
+            make_env(sport, num_worlds=1, options={"reach": -1.0})
+
+
 def aimed(x: float, y: float) -> tuple[float, float, float]:
     """Velocity that carries a ball from (9.5, 1, 1.2) to a place on the ground: read off a fan of
     shots that differ in their slopes."""
