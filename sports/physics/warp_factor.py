@@ -6,9 +6,10 @@
   takes a tree of a world into its shared memory and goes through all levels. The algorithm is the
   same: L^T D L along the ancestors of each degree of freedom; Featherstone, Rigid Body Dynamics
   Algorithms (2008), section 6.5.
+* Newton's direction: ``warp_newton.py``, for up to 200 degrees of freedom.
 * Of more than 96 degrees of freedom it asks which 16 x 16 tiles of the solver's Hessian are zero,
   with half a million blocks of threads that mostly have nothing to do (13 %). Here a block takes a
-  world.
+  world; for models that are too large for the direction above.
 
 This module alone depends on MuJoCo Warp's inner names (4.0); ``tests/sports/test_warp_factor.py``
 says whether another version still has them.
@@ -27,13 +28,15 @@ import numpy as np
 import warp as wp
 from mujoco_warp._src import smooth, solver, types
 
+from sports.physics.warp_newton import MOST, find_direction
+
 LANES = 128
 """Threads of a block: four rows of 32."""
 SMALL = int(types.M_BLOCK_DENSE_MAX)
 """Trees of at most so many degrees of freedom are not factored here."""
 TILE = int(types.TILE_SIZE_JTDAJ_DENSE)
-MANY = int(solver._SPARSE_BLOCK_CHOLESKY_DIM)
-"""Models of more degrees of freedom have their Hessian's tiles looked at."""
+FEW = int(solver._BLOCK_CHOLESKY_DIM)
+"""Models of at most so many degrees of freedom are left to MuJoCo Warp."""
 
 _FACTOR = """
 #if defined(__CUDA_ARCH__)
@@ -230,9 +233,12 @@ def find_tiles(m: Any, d: Any, ctx: Any, skip_unchanged: bool, skip_noflip: bool
 def solve_direction(
     m: Any, d: Any, ctx: Any, skip_unchanged: bool = False, skip_noflip: bool = False
 ) -> None:
-    """In place of ``solver._cholesky_factorize_solve`` for models of many degrees of freedom: the
-    tiles are found by one block a world, the rest is MuJoCo Warp's."""
-    if m.nv <= MANY:
+    """In place of ``solver._cholesky_factorize_solve``. Larger models than ``warp_newton`` takes
+    have their tiles found by one block a world; the rest is MuJoCo Warp's."""
+    if FEW < m.nv <= MOST:
+        find_direction(m, d, ctx, skip_noflip)
+        return
+    if m.nv <= FEW:
         _their_direction(m, d, ctx, skip_unchanged, skip_noflip)
         return
     changed = ctx.quad_changed_count if skip_unchanged else d.nefc
