@@ -3,9 +3,9 @@
 * MuJoCo Warp factors the joint-space inertia of a tree of more than 64 degrees of freedom with one
   kernel for every level of the tree, each passing over the memory of all worlds: 70 launches a
   substep, 45 % of a control step of SMPL-X on an H200 and 39 % of SMPL's. Here a block of threads
-  takes a tree of a world into its shared memory and goes through all levels. The algorithm is the
-  same: L^T D L along the ancestors of each degree of freedom; Featherstone, Rigid Body Dynamics
-  Algorithms (2008), section 6.5.
+  takes a tree of a world into its shared memory, goes through all levels and solves at once. The
+  algorithm is the same: L^T D L along the ancestors of each degree of freedom; Featherstone, Rigid
+  Body Dynamics Algorithms (2008), section 6.5.
 * Newton's direction: ``warp_newton.py``, for up to 200 degrees of freedom.
 * Of more than 96 degrees of freedom it asks which 16 x 16 tiles of the solver's Hessian are zero,
   with half a million blocks of threads that mostly have nothing to do (13 %). Here a block takes a
@@ -40,11 +40,13 @@ FEW = int(solver._BLOCK_CHOLESKY_DIM)
 
 _FACTOR = """
 #if defined(__CUDA_ARCH__)
-    __shared__ float rows[SIZE];
-    __shared__ unsigned short targets[SIZE], starts[DOFS + 1];
+    __shared__ float rows[SIZE], rhs[DOFS];
+    __shared__ unsigned short columns[SIZE], starts[DOFS + 1];
+#define WAIT_WARP() __syncwarp()
 #else
-    float rows[SIZE];
-    unsigned short targets[SIZE], starts[DOFS + 1];
+    float rows[SIZE], rhs[DOFS];
+    unsigned short columns[SIZE], starts[DOFS + 1];
+#define WAIT_WARP()
 #endif
     const int first = tree[0], dofs = tree[1] - first + 1, base = begin.data[first];
     const int size = begin.data[tree[1]] + length.data[tree[1]] - base;
@@ -54,10 +56,16 @@ _FACTOR = """
     float* inverses = (float*)((char*)diagonal.data + world * diagonal.strides[0]);
     for (int e = lane; e < size; e += lanes) {
         rows[e] = source[base + e];
-        targets[e] = (unsigned short)(begin.data[column.data[base + e]] - base);
+        columns[e] = (unsigned short)(column.data[base + e] - first);
     }
     for (int k = lane; k < dofs; k += lanes)
         starts[k] = (unsigned short)(begin.data[first + k] - base);
+#if SOLVE
+    const float* right = (const float*)((const char*)force.data + world * force.strides[0]);
+    float* solution = (float*)((char*)solved.data + world * solved.strides[0]);
+    for (int k = lane; k < dofs; k += lanes)
+        rhs[k] = right[first + k];
+#endif
     if (lane == 0)
         starts[dofs] = (unsigned short)size;
     WP_TILE_SYNC();
@@ -66,6 +74,13 @@ _FACTOR = """
     for (int k = dofs - 1; k >= 0; --k) {
         const int row = starts[k], ancestors = starts[k + 1] - row - 1;
         const float scale = 1.0f / rows[row + ancestors];
+#if SOLVE
+        if (high == 0) {
+            const float known = rhs[k] * scale;
+            for (int a = across; a < ancestors; a += width)
+                rhs[columns[row + a]] -= rows[row + a] * known;
+        }
+#endif
         for (int b = across; b < ancestors; b += width) {
             const float share = rows[row + b] * scale;
             // All lanes of a row of 32 go through the same rows a >= b, four of them at a time.
@@ -77,7 +92,7 @@ _FACTOR = """
 #pragma unroll
                 for (int j = 0; j < 4; ++j) {
                     const int c = a + j * stride;
-                    place[j] = c >= b && c < ancestors ? targets[row + c] + b : -1;
+                    place[j] = c >= b && c < ancestors ? starts[columns[row + c]] + b : -1;
                     if (place[j] >= 0)
                         value[j] = rows[place[j]] - share * rows[row + c];
                 }
@@ -89,6 +104,21 @@ _FACTOR = """
         }
         WP_TILE_SYNC();
     }
+#if SOLVE
+    // What a degree of freedom has found is taken from its descendants, which follow it.
+    if (high == 0) {
+        for (int k = 0; k < dofs; ++k) {
+            const int depth = starts[k + 1] - starts[k] - 1, end = ends.data[first + k] - first;
+            const float x = rhs[k] / rows[starts[k] + depth];
+            WAIT_WARP();
+            for (int i = k + 1 + across; i < end; i += width)
+                rhs[i] -= rows[starts[i] + depth] * x;
+            if (across == 0)
+                solution[first + k] = x;
+            WAIT_WARP();
+        }
+    }
+#endif
     for (int k = high; k < dofs; k += stride) {
         const int row = starts[k], ancestors = starts[k + 1] - row - 1;
         const float pivot = rows[row + ancestors], scale = 1.0f / pivot;
@@ -104,11 +134,14 @@ _FACTOR = """
 
 
 @cache
-def factor_kernel(size: int, dofs: int) -> wp.Kernel:
+def factor_kernel(size: int, dofs: int, solve: bool) -> wp.Kernel:
     """L and 1/D of the inertia of trees with at most ``size`` entries: a row for each of at most
-    ``dofs`` degrees of freedom, a column for each of its ancestors and itself."""
+    ``dofs`` degrees of freedom, a column for each of its ancestors and itself. With ``solve`` also
+    the accelerations (``solved``) that forces give such an inertia. ``ends``: for each degree of
+    freedom the first one after it that does not hang on it."""
+    snippet = _FACTOR.replace("SIZE", str(size)).replace("DOFS", str(dofs))
 
-    @wp.func_native(snippet=_FACTOR.replace("SIZE", str(size)).replace("DOFS", str(dofs)))
+    @wp.func_native(snippet=snippet.replace("SOLVE", str(int(solve))))
     def factor_tree(
         w: int,
         lane: int,
@@ -117,9 +150,12 @@ def factor_kernel(size: int, dofs: int) -> wp.Kernel:
         length: wp.array(dtype=int),  # type: ignore[valid-type]
         begin: wp.array(dtype=int),  # type: ignore[valid-type]
         column: wp.array(dtype=int),  # type: ignore[valid-type]
+        ends: wp.array(dtype=int),  # type: ignore[valid-type]
         inertia: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        force: wp.array2d(dtype=float),  # type: ignore[valid-type]
         factor: wp.array2d(dtype=float),  # type: ignore[valid-type]
         diagonal: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        solved: wp.array2d(dtype=float),  # type: ignore[valid-type]
     ): ...
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -128,13 +164,19 @@ def factor_kernel(size: int, dofs: int) -> wp.Kernel:
         length: wp.array(dtype=int),  # type: ignore[valid-type]
         begin: wp.array(dtype=int),  # type: ignore[valid-type]
         column: wp.array(dtype=int),  # type: ignore[valid-type]
+        ends: wp.array(dtype=int),  # type: ignore[valid-type]
         inertia: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        force: wp.array2d(dtype=float),  # type: ignore[valid-type]
         factor: wp.array2d(dtype=float),  # type: ignore[valid-type]
         diagonal: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        solved: wp.array2d(dtype=float),  # type: ignore[valid-type]
     ):
         w, t, lane = wp.tid()
         lanes = wp.block_dim()
-        factor_tree(w, lane, lanes, trees[t], length, begin, column, inertia, factor, diagonal)
+        factor_tree(
+            w, lane, lanes, trees[t], length, begin, column, ends,
+            inertia, force, factor, diagonal, solved,
+        )  # fmt: skip
 
     return factor_trees
 
@@ -185,19 +227,35 @@ class Pieces:
 
     trees: wp.array
     """(T,) first and last degree of freedom of the trees that are factored here."""
+    ends: wp.array
+    """(nv,) for each degree of freedom the first one after it that does not hang on it."""
     size: int
-    """Entries of the inertia of the largest one."""
+    """Entries of the inertia of the largest tree."""
     dofs: int
     """Its degrees of freedom."""
 
     def factor(self, m: Any, d: Any, M: wp.array, L: wp.array, D: wp.array) -> None:
         """In place of ``smooth._factor_i_sparse``."""
+        self._launch(m, d, M, L, D)
+
+    def factor_and_solve(
+        self, m: Any, d: Any, M: wp.array, L: wp.array, D: wp.array, x: wp.array, y: wp.array
+    ) -> None:
+        """In place of ``smooth.factor_solve_i``: M x = y. Small trees are MuJoCo Warp's."""
+        if m.M_tiles:
+            smooth._factor_solve_blocks(m, d, M, L, D, x, y)
+        self._launch(m, d, M, L[:, m.qLD_block_total :], D, x, y)
+
+    def _launch(
+        self, m: Any, d: Any, M: wp.array, L: wp.array, D: wp.array, *solve: wp.array
+    ) -> None:
         lanes = LANES if wp.get_device().is_cuda else 1
+        solved, force = solve or (D, D)
         wp.launch(
-            factor_kernel(self.size, self.dofs),
+            factor_kernel(self.size, self.dofs, bool(solve)),
             dim=(d.nworld, self.trees.shape[0], lanes),
-            inputs=[self.trees, m.M_rownnz, m.M_rowadr, m.M_colind, M],
-            outputs=[L, D],
+            inputs=[self.trees, m.M_rownnz, m.M_rowadr, m.M_colind, self.ends, M, force],
+            outputs=[L, D, solved],
             block_dim=lanes,
         )
 
@@ -207,12 +265,20 @@ def pieces(model: mujoco.MjModel) -> Pieces:
     starts = np.asarray(model.tree_dofadr)
     last = starts + np.asarray(model.tree_dofnum) - 1
     large = np.flatnonzero(last - starts >= SMALL)
-    entry = np.asarray(model.M_rowadr), np.asarray(model.M_rownnz)
-    sizes = [entry[0][last[t]] + entry[1][last[t]] - entry[0][starts[t]] for t in large]
+    begin, length = np.asarray(model.M_rowadr), np.asarray(model.M_rownnz)
+    sizes = [begin[last[t]] + length[last[t]] - begin[starts[t]] for t in large]
     trees = np.stack((starts[large], last[large]), 1).astype(np.int32)
     dofs = trees[:, 1] - trees[:, 0] + 1
+    ends = np.arange(1, model.nv + 1)
+    for k in reversed(range(model.nv)):
+        parent = model.dof_parentid[k]
+        if parent >= 0:
+            ends[parent] = max(ends[parent], ends[k])
     return Pieces(
-        wp.array(trees, dtype=wp.vec2i), int(max(sizes, default=0)), int(dofs.max(initial=0))
+        wp.array(trees, dtype=wp.vec2i),
+        wp.array(ends.astype(np.int32), dtype=int),
+        int(max(sizes, default=0)),
+        int(dofs.max(initial=0)),
     )
 
 
@@ -282,12 +348,12 @@ _their_direction = solver._cholesky_factorize_solve
 @contextmanager
 def faster(own: Pieces) -> Iterator[None]:
     """MuJoCo Warp works with the pieces of this module inside the block."""
-    theirs = smooth._factor_i_sparse
+    theirs = smooth._factor_i_sparse, smooth.factor_solve_i
     try:
         if own.size:
-            smooth._factor_i_sparse = own.factor
+            smooth._factor_i_sparse, smooth.factor_solve_i = own.factor, own.factor_and_solve
         solver._cholesky_factorize_solve = solve_direction
         yield
     finally:
-        smooth._factor_i_sparse = theirs
+        smooth._factor_i_sparse, smooth.factor_solve_i = theirs
         solver._cholesky_factorize_solve = _their_direction

@@ -24,7 +24,7 @@ DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.i
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("task", ["long_jump", "javelin", "tennis_1v1"])
-def test_the_inertia_of_every_world_is_factored(task: str, device: str):
+def test_the_inertia_of_every_world_is_factored_and_solved(task: str, device: str):
     """Against C MuJoCo in double precision, at other poses in every world."""
     scene = make_scene(task)
     physics = WarpPhysics(scene, 3, device)
@@ -35,22 +35,36 @@ def test_the_inertia_of_every_world_is_factored(task: str, device: str):
     pose[:, 3:7] = torch.nn.functional.normalize(pose[:, 3:7], dim=-1)
     physics.qpos.copy_(pose)
     m, d = physics.m, physics.d
+    factors = []
+    force = torch.randn(3, model.nv, generator=noise)
     with wp.ScopedDevice(device), faster(pieces(model)):
         smooth.kinematics(m, d)
         smooth.com_pos(m, d)
         smooth.crb(m, d)
-        smooth.factor_m(m, d)
+        solved = []
+        for solve in (False, True):
+            wp.to_torch(d.qLD).fill_(torch.nan)
+            wp.to_torch(d.qLDiagInv).fill_(torch.nan)
+            if solve:
+                x, y = wp.zeros((3, model.nv), dtype=float), wp.array(force.numpy(), dtype=float)
+                smooth.factor_solve_i(m, d, d.M, d.qLD, d.qLDiagInv, x, y)
+                solved = x.numpy()
+            else:
+                smooth.factor_m(m, d)
+            factors.append((d.qLD.numpy()[:, m.qLD_block_total :], d.qLDiagInv.numpy()))
     sparse = m.qLD_block_adr.numpy() == -1
     assert sparse.sum() == (150 if task == "tennis_1v1" else scene.body.num_dofs + 6)
-    factor = d.qLD.numpy()[:, m.qLD_block_total :]
     for world in range(3):
         data.qpos[:] = physics.qpos[world].cpu().numpy()
         mujoco.mj_forward(model, data)
-        inverse = d.qLDiagInv.numpy()[world]
-        assert np.abs(inverse / data.qLDiagInv - 1)[sparse].max() < 1e-4
-        for k in np.flatnonzero(sparse):
-            row = slice(model.M_rowadr[k], model.M_rowadr[k] + model.M_rownnz[k] - 1)
-            assert np.allclose(factor[world, row], data.qLD[row], atol=5e-4)
+        for factor, inverse in factors:
+            assert np.abs(inverse[world] / data.qLDiagInv - 1)[sparse].max() < 1e-4
+            for k in np.flatnonzero(sparse):
+                row = slice(model.M_rowadr[k], model.M_rowadr[k] + model.M_rownnz[k] - 1)
+                assert np.allclose(factor[world, row], data.qLD[row], atol=5e-4)
+        expected = np.zeros((1, model.nv))
+        mujoco.mj_solveM(model, data, expected, force[world : world + 1].double().numpy())
+        assert np.abs(solved[world] - expected).max() < 1e-3 * np.abs(expected).max()
     physics.close()
 
 
@@ -127,11 +141,14 @@ def test_the_direction_of_every_world_solves_its_equations(dofs: int, device: st
 
 
 def test_the_library_is_as_before_outside_the_block():
-    own = smooth._factor_i_sparse, solver._cholesky_factorize_solve
+    def inner() -> tuple:
+        return smooth._factor_i_sparse, smooth.factor_solve_i, solver._cholesky_factorize_solve
+
+    own = inner()
     with pytest.raises(ZeroDivisionError), faster(pieces(build_model(make_scene("long_jump")))):
-        assert smooth._factor_i_sparse is not own[0]
+        assert not set(inner()) & set(own)
         raise ZeroDivisionError
-    assert (smooth._factor_i_sparse, solver._cholesky_factorize_solve) == own
+    assert inner() == own
 
 
 @pytest.mark.parametrize("task", ["long_jump", "javelin", "tennis_1v1", "basketball_1v1"])
