@@ -65,7 +65,7 @@ def read_npz(
             missing = [name for name in required if name not in names]
             if missing:
                 raise ValueError(f"it lacks '{missing[0]}'")
-            arrays = {name: _array(archive, members[f"{name}.npy"]) for name in sorted(names)}
+            arrays = {name: read_member(archive, members[f"{name}.npy"]) for name in sorted(names)}
         meta = json.loads(str(arrays.pop("meta")))
         if not isinstance(meta, dict):
             raise ValueError("its metadata is not a JSON object")
@@ -93,8 +93,11 @@ def _sentence(error: BaseException) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """One member, after its header and its length have been found to agree."""
+def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """One array of a zip, after its header and its length have been found to agree.
+
+    Raises ValueError for an array of objects, a forged shape or a member that is cut off.
+    """
     with archive.open(info) as member:
         data = member.read(MAX_BYTES + 1)
     stream = io.BytesIO(data)

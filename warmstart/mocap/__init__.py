@@ -1,0 +1,1 @@
+"""Motion of people, from the files it comes in to clips of our bodies."""

@@ -1,0 +1,263 @@
+"""Feet on the floor: contacts, grounding frame by frame, and feet that stay where they stand.
+
+A sole has two parts that bear weight, heel and ball. A part is in contact when it is slow and low.
+Where a foot is down the athlete is moved so that its sole is on the floor; between contacts, in a
+flight, the move passes smoothly from one to the next, so that a flight keeps its arc. Then the legs
+take up what is left, so that soles in contact are level with the floor and do not slide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import (
+    binary_closing,
+    binary_opening,
+    gaussian_filter1d,
+    maximum_filter1d,
+    minimum_filter1d,
+)
+
+from warmstart.mocap.capture import SIDES
+from warmstart.mocap.fit import Aim, fit
+from warmstart.mocap.kinematics import Chain, Frames, exp
+
+SLOW = 0.4
+"""A part of a sole in contact moves at less than this (m/s)."""
+LOW = 0.05
+"""It is at most this far (m) above the lowest place of both feet within ``AROUND``..."""
+AROUND = 0.6
+"""... seconds before and after."""
+LOWEST = 0.06
+"""And at most this far (m) above the lowest point of the body."""
+SMOOTH = 0.05
+"""Standard deviation (s) of the smoothing of the move."""
+BLEND = 0.25
+"""A correction of a foot dies away within this time (s) from its contact."""
+SLIDE = 0.15
+"""A contact that slides further than this (m) is left to slide by the rest."""
+LEG_HOLD = {"Hip": 0.05, "Knee": 0.05, "Ankle": 0.3}
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """What the source's motion says about its feet."""
+
+    down: np.ndarray
+    """(T, 2, 2) whether left, right foot's heel, ball is in contact."""
+
+    @property
+    def foot(self) -> np.ndarray:
+        """(T, 2) whether any part of a foot is."""
+        return self.down.any(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Grounded:
+    """A motion on the floor, and what it took."""
+
+    root: np.ndarray
+    local: np.ndarray
+    contacts: Contacts
+    moved: np.ndarray
+    """(T,) how far the whole athlete was moved upward (m)."""
+
+
+class Soles:
+    """Places of heel and ball of both feet, from the shapes of ankle and toe links."""
+
+    def __init__(self, chain: Chain) -> None:
+        self.chain = chain
+        self.sets: list[list[np.ndarray]] = []
+        middle: list[list[tuple[int, np.ndarray]]] = []
+        for side in SIDES:
+            ankle, toe = chain.index[side + "Ankle"], chain.index[side + "Toe"]
+            of_ankle = np.flatnonzero(chain.surface_link == ankle)
+            x = chain.surface_point[of_ankle, 0]
+            back = of_ankle[x < x.mean()]
+            front = np.concatenate(
+                [of_ankle[x >= x.mean()], np.flatnonzero(chain.surface_link == toe)]
+            )
+            self.sets.append([back, front])
+            low = back[np.argsort(chain.surface_point[back, 2])[:2]]
+            heel = (ankle, chain.surface_point[low].mean(0))
+            point = chain.surface_point[chain.surface_link == toe]
+            ball = (toe, np.array([0.0, point[:, 1].mean(), point[:, 2].min()]))
+            middle.append([heel, ball])
+        self.middle = middle
+        self.feet = np.concatenate([np.concatenate(s) for s in self.sets])
+
+    def heights(self, surface: np.ndarray) -> np.ndarray:
+        """(T, 2, 2) height of the lowest point of each part, from heights (T, S) of all points."""
+        return np.stack(
+            [np.stack([surface[:, s].min(1) for s in foot], -1) for foot in self.sets], axis=1
+        )
+
+    def places(self, frames: Frames) -> np.ndarray:
+        """(T, 2, 2, 3) middle of each part's contact line (m)."""
+        rows = [
+            np.stack([frames.origin[:, i] + frames.turn[:, i] @ p for i, p in foot], axis=1)
+            for foot in self.middle
+        ]
+        return np.stack(rows, axis=1)
+
+
+def find_contacts(chain: Chain, frames: Frames, fps: float) -> Contacts:
+    """Which parts of the soles are in contact, from a motion that was not grounded yet."""
+    soles = Soles(chain)
+    surface = chain.heights(frames)
+    height, place = soles.heights(surface), soles.places(frames)
+    speed = np.linalg.norm(np.gradient(place, 1 / fps, axis=0), axis=-1)
+    reach = 2 * round(AROUND * fps) + 1
+    base = minimum_filter1d(height.min((1, 2)), reach, mode="nearest")
+    down = speed < SLOW
+    down &= height < base[:, None, None] + LOW
+    down &= height < surface.min(1)[:, None, None] + LOWEST
+    gap = np.ones(max(2, round(0.05 * fps)), dtype=bool)
+    for foot in range(2):
+        for part in range(2):
+            closed = binary_closing(np.pad(down[:, foot, part], 9, mode="edge"), gap)[9:-9]
+            long = binary_opening(np.pad(closed, 9, mode="edge"), gap)[9:-9]
+            down[:, foot, part] = long & (height[:, foot, part] < base + 2 * LOW)
+    return Contacts(down)
+
+
+def ground(
+    chain: Chain, root: np.ndarray, local: np.ndarray, fps: float, passes: int = 2
+) -> Grounded:
+    """Puts a motion (T frames, z up, any height) on the floor z = 0."""
+    soles = Soles(chain)
+    frames = chain.frames(root, local)
+    contacts = find_contacts(chain, frames, fps)
+    local = _level_toes(chain, soles, frames, local, fps)
+    surface = chain.heights(chain.frames(root, local))
+    moved = _move(soles, surface, contacts, fps)
+    root = root + moved[:, None] * np.array([0.0, 0.0, 1.0])
+    for _ in range(passes):
+        root, local = _plant(chain, soles, root, local, contacts, fps)
+    low = chain.heights(chain.frames(root, local)).min(1)
+    rest = _cover(np.maximum(0.0, -0.005 - low), fps)
+    root = root + rest[:, None] * np.array([0.0, 0.0, 1.0])
+    return Grounded(root, local, contacts, moved + rest)
+
+
+def _move(soles: Soles, surface: np.ndarray, contacts: Contacts, fps: float) -> np.ndarray:
+    """(T,) upward move of the whole athlete (m)."""
+    height = np.where(contacts.down, soles.heights(surface), np.inf).min((1, 2))
+    known = np.flatnonzero(np.isfinite(height))
+    if len(known):
+        move = np.interp(np.arange(len(height)), known, -height[known])
+        move = gaussian_filter1d(move, SMOOTH * fps, mode="nearest")
+    else:
+        move = np.full(len(height), -np.percentile(surface.min(1), 2))
+    others = np.ones(surface.shape[1], dtype=bool)
+    others[soles.feet] = False
+    sunk = np.maximum(0.0, -(surface[:, others].min(1) + move))
+    return move + _cover(sunk, fps)
+
+
+def _cover(need: np.ndarray, fps: float) -> np.ndarray:
+    """(T,) a smooth curve nowhere below ``need`` (T,) >= 0, and zero far from where it is > 0."""
+    width = 0.1 * fps
+    wide = maximum_filter1d(need, 2 * max(1, round(2 * width)) + 1, mode="nearest")
+    return np.maximum(need, gaussian_filter1d(wide, width, mode="nearest", truncate=2.0))
+
+
+def _level_toes(
+    chain: Chain, soles: Soles, frames: Frames, local: np.ndarray, fps: float
+) -> np.ndarray:
+    """Bends toes up where a foot rolls over them, instead of into the floor."""
+    height = soles.heights(chain.heights(frames))
+    base = minimum_filter1d(height.min((1, 2)), 2 * round(AROUND * fps) + 1, mode="nearest")
+    local = local.copy()
+    for foot, side in enumerate(SIDES):
+        toe = chain.index[side + "Toe"]
+        joint = frames.origin[:, toe, 2] - base
+        near = np.clip(2.0 - joint / 0.06, 0.0, 1.0)
+        down = np.arcsin(np.clip(-frames.turn[:, toe, 2, 0], -1, 1))
+        upright = frames.turn[:, toe, 2, 2] > 0.2  # not for a foot on its back
+        bend = np.clip(down - 0.05, 0.0, 1.0) * near * upright
+        local[:, toe] = local[:, toe] @ exp(-bend[:, None] * np.array([0.0, 1.0, 0.0]))
+    return local
+
+
+def _plant(
+    chain: Chain,
+    soles: Soles,
+    root: np.ndarray,
+    local: np.ndarray,
+    contacts: Contacts,
+    fps: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Legs bent so that soles in contact are on the floor and stay in place."""
+    frames = chain.frames(root, local)
+    height = soles.heights(chain.heights(frames))
+    place = soles.places(frames)
+    targets, weights, hold = {}, {}, {}
+    for foot, side in enumerate(SIDES):
+        shift = _correction(height[:, foot], place[:, foot], contacts.down[:, foot], fps)
+        for joint in ("Ankle", "Toe"):
+            name = side + joint
+            targets[name] = frames.origin[:, chain.index[name]] + shift
+            weights[name] = 10.0
+        targets[side + "Knee"] = frames.origin[:, chain.index[side + "Knee"]]
+        weights[side + "Knee"] = 0.1  # the leg keeps its plane
+        hold |= {side + joint: value for joint, value in LEG_HOLD.items()}
+    return fit(chain, root, local, Aim(targets, weights, hold, hold_root=5.0), steps=3)
+
+
+def _correction(
+    height: np.ndarray, place: np.ndarray, down: np.ndarray, fps: float
+) -> np.ndarray:
+    """(T, 3) by how much a foot must be moved: heights and places of heel and ball (T, 2, ...)."""
+    frames = len(height)
+    shift = np.zeros((frames, 3))
+    known = down.any(1)
+    shift[known, 2] = -np.where(down, height, np.inf).min(1)[known]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], known.astype(int), [0]])))
+    spans = list(zip(edges[::2], edges[1::2]))
+    for first, last in spans:
+        both = down[first : last - 1] & down[first + 1 : last]
+        step = np.diff(place[first:last, :, :2], axis=0)
+        count = np.maximum(both.sum(1), 1)[:, None]
+        slide = np.cumsum((step * both[..., None]).sum(1) / count, axis=0)
+        slide = np.concatenate([np.zeros((1, 2)), slide])
+        slide -= slide.mean(0)
+        far = np.linalg.norm(slide, axis=1).max()
+        shift[first:last, :2] = -slide * min(1.0, SLIDE / max(far, 1e-9))
+    shift = _bridge(shift, spans, round(BLEND * fps))
+    sunk = np.maximum(0.0, -(height.min(1) + shift[:, 2]))
+    shift[:, 2] += np.where(known, 0.0, _cover(sunk, fps))
+    return shift
+
+
+def _bridge(shift: np.ndarray, spans: list[tuple[int, int]], reach: int) -> np.ndarray:
+    """Fills the frames between contacts: from one correction to the next, or down to none."""
+    frames = len(shift)
+    out = shift.copy()
+    reach = max(reach, 1)
+    ends = [(0, spans[0][0])] if spans else []
+    ends += [(a[1], b[0]) for a, b in zip(spans, spans[1:])]
+    ends += [(spans[-1][1], frames)] if spans else []
+    for first, last in ends:
+        size = last - first
+        if size <= 0:
+            continue
+        s = np.arange(1, size + 1)
+        before = shift[first - 1] if first > 0 else None
+        after = shift[last] if last < frames else None
+        if before is not None and after is not None and size <= 2 * reach:
+            x = s / (size + 1)
+            x = (x * x * (3 - 2 * x))[:, None]
+            out[first:last] = (1 - x) * before + x * after
+            continue
+        part = np.zeros((size, 3))
+        if before is not None:
+            x = np.clip(1 - s / reach, 0, 1)[:, None]
+            part += x * x * (3 - 2 * x) * before
+        if after is not None:
+            x = np.clip(1 - (size + 1 - s) / reach, 0, 1)[:, None]
+            part += x * x * (3 - 2 * x) * after
+        out[first:last] = part
+    return out
