@@ -1,4 +1,8 @@
-"""Inverse kinematics of many frames at once: damped Gauss-Newton on positions and rotations."""
+"""Inverse kinematics of many frames at once: damped Gauss-Newton on positions and rotations.
+
+The damping of each frame is its own (Levenberg and Marquardt): a step that makes a frame worse is
+taken back and tried shorter.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,12 @@ from warmstart.mocap.kinematics import Chain, Frames, exp, log
 
 CHUNK = 128
 """Frames solved together: the Jacobians of more do not stay in the cache."""
-DAMPING = 1e-6
+FIRST, LEAST, MOST = 1e-3, 1e-7, 1e3
+"""Damping to begin with and its bounds, relative to the diagonal of the normal equations."""
+FLOOR = 1e-6
+"""Damping that is always there, for directions that nothing holds."""
+LARGEST = 0.6
+"""No link turns by more than this in a step (rad)."""
 STEPS = 4
 
 
@@ -39,19 +48,17 @@ def fit(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Root positions (T, 3) and local rotations (T, B, 3, 3) nearest the aim, from a first guess.
 
-    Gauss-Newton with a fixed small damping; rotations are updated on the right,
-    ``R <- R exp(delta)``, so that there is no singular pose.
+    Rotations are updated on the right, ``R <- R exp(delta)``, so that there is no singular pose.
     """
     plan = _Plan(chain, aim)
     out_root, out_local = root.copy(), local.copy()
     for start in range(0, len(root), CHUNK):
         rows = slice(start, start + CHUNK)
-        r, q = root[rows], local[rows]
-        guess_r, guess_q = r, q[:, plan.links]
         target = np.stack([aim.targets[name][rows] for name in plan.names], axis=1)
+        problem = _Problem(plan, root[rows], local[rows], target)
         for _ in range(steps):
-            r, q = plan.step(r, q, guess_r, guess_q, target)
-        out_root[rows], out_local[rows] = r, q
+            problem.step()
+        out_root[rows], out_local[rows] = problem.best_root, problem.best_local
     return out_root, out_local
 
 
@@ -76,35 +83,7 @@ class _Plan:
         self.pair_row, self.pair_column, self.pair_joint, self.pair_link = np.array(pairs).T
         self.width = 3 + 3 * len(self.links)
 
-    def step(
-        self,
-        root: np.ndarray,
-        local: np.ndarray,
-        guess_root: np.ndarray,
-        guess_local: np.ndarray,
-        target: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        frames = self.chain.frames(root, local)
-        jacobian = self._jacobian(frames)
-        error = (target - frames.origin[:, self.joints]) * self.weight[:, None]
-        normal = np.swapaxes(jacobian, 1, 2) @ jacobian
-        slope = (np.swapaxes(jacobian, 1, 2) @ error.reshape(len(root), -1, 1))[..., 0]
-        away = log(np.swapaxes(guess_local, -1, -2) @ local[:, self.links])
-        stiff = np.repeat(self.hold**2, 3)
-        slope[:, 3:] -= stiff * away.reshape(len(root), -1)
-        slope[:, :3] -= self.hold_root**2 * (root - guess_root)
-        diagonal = np.concatenate([np.full(3, self.hold_root**2), stiff]) + DAMPING
-        index = np.arange(self.width)
-        normal[:, index, index] += diagonal
-        delta = np.linalg.solve(normal, slope[..., None])[..., 0]
-        turn = delta[:, 3:].reshape(len(root), -1, 3)
-        size = np.linalg.norm(turn, axis=-1, keepdims=True)
-        turn = turn / np.maximum(1.0, size / 0.8)  # no link turns by more than 0.8 rad a step
-        local = local.copy()
-        local[:, self.links] = local[:, self.links] @ exp(turn)
-        return root + delta[:, :3], local
-
-    def _jacobian(self, frames: Frames) -> np.ndarray:
+    def jacobian(self, frames: Frames) -> np.ndarray:
         """(T, 3 K, 3 + 3 L) derivative of the weighted joints by root and link rotations."""
         count = len(frames.origin)
         out = np.zeros((count, len(self.joints), 3, self.width))
@@ -119,3 +98,64 @@ class _Plan:
         view[:, self.pair_row, :, self.pair_column] = np.moveaxis(block, 1, 0)
         out[..., 3:] = view.reshape(count, len(self.joints), 3, -1)
         return out.reshape(count, -1, self.width)
+
+
+class _Problem:
+    """Some frames on their way."""
+
+    def __init__(
+        self, plan: _Plan, root: np.ndarray, local: np.ndarray, target: np.ndarray
+    ) -> None:
+        self.plan = plan
+        self.guess_root, self.guess_local, self.target = root, local[:, plan.links], target
+        self.damping = np.full(len(root), FIRST)
+        self.best_root, self.best_local = root, local
+        self.cost, self.error, self.away, self.frames = self._weigh(root, local)
+
+    def _weigh(self, root: np.ndarray, local: np.ndarray) -> tuple:
+        """Cost (T,), weighted errors of joints, turns away from the guess, and kinematics."""
+        plan = self.plan
+        frames = plan.chain.frames(root, local)
+        error = (self.target - frames.origin[:, plan.joints]) * plan.weight[:, None]
+        away = log(np.swapaxes(self.guess_local, -1, -2) @ local[:, plan.links])
+        cost = (error**2).sum((1, 2)) + ((plan.hold[:, None] * away) ** 2).sum((1, 2))
+        cost += plan.hold_root**2 * ((root - self.guess_root) ** 2).sum(1)
+        return cost, error, away, frames
+
+    def step(self) -> None:
+        """One step of every frame; those that it makes worse stay where they are."""
+        plan, count = self.plan, len(self.cost)
+        jacobian = plan.jacobian(self.frames)
+        normal = np.swapaxes(jacobian, 1, 2) @ jacobian
+        slope = (np.swapaxes(jacobian, 1, 2) @ self.error.reshape(count, -1, 1))[..., 0]
+        stiff = np.repeat(plan.hold**2, 3)
+        slope[:, 3:] -= stiff * self.away.reshape(count, -1)
+        slope[:, :3] -= plan.hold_root**2 * (self.best_root - self.guess_root)
+        index = np.arange(plan.width)
+        normal[:, index, index] += np.concatenate([np.full(3, plan.hold_root**2), stiff])
+        normal[:, index, index] *= 1.0 + self.damping[:, None]
+        normal[:, index, index] += FLOOR
+        delta = np.linalg.solve(normal, slope[..., None])[..., 0]
+        turn = delta[:, 3:].reshape(count, -1, 3)
+        size = np.linalg.norm(turn, axis=-1).max(1)
+        share = np.minimum(1.0, LARGEST / np.maximum(size, 1e-12))[:, None]
+        root = self.best_root + share * delta[:, :3]
+        local = self.best_local.copy()
+        local[:, plan.links] = local[:, plan.links] @ exp(share[..., None] * turn)
+        cost, error, away, frames = self._weigh(root, local)
+        good = cost <= self.cost
+        self.damping = np.clip(np.where(good, self.damping / 8, self.damping * 8), LEAST, MOST)
+        if good.all():
+            self.best_root, self.best_local = root, local
+            self.cost, self.error, self.away, self.frames = cost, error, away, frames
+            return
+
+        def pick(new: np.ndarray, old: np.ndarray) -> np.ndarray:
+            return np.where(good.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+
+        self.best_root, self.best_local = pick(root, self.best_root), pick(local, self.best_local)
+        self.cost, self.error = pick(cost, self.cost), pick(error, self.error)
+        self.away = pick(away, self.away)
+        self.frames = Frames(
+            pick(frames.origin, self.frames.origin), pick(frames.turn, self.frames.turn)
+        )

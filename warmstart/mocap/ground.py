@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import (
     binary_closing,
-    binary_opening,
     gaussian_filter1d,
     maximum_filter1d,
     minimum_filter1d,
@@ -23,9 +22,10 @@ from warmstart.mocap.capture import SIDES
 from warmstart.mocap.fit import Aim, fit
 from warmstart.mocap.kinematics import Chain, Frames, exp
 
-SLOW = 0.4
-"""A part of a sole in contact moves at less than this (m/s)."""
-LOW = 0.05
+SLOW, FAST = 0.3, 0.7
+"""A part of a sole in contact stands when it moves at less than the first (m/s), and leaves its
+place when it moves at more than the second; between them what went before goes on."""
+LOW = 0.06
 """It is at most this far (m) above the lowest place of both feet within ``AROUND``..."""
 AROUND = 0.6
 """... seconds before and after."""
@@ -37,7 +37,11 @@ BLEND = 0.25
 """A correction of a foot dies away within this time (s) from its contact."""
 SLIDE = 0.15
 """A contact that slides further than this (m) is left to slide by the rest."""
+EASE = 0.05
+"""A foot takes this long (s) to come to rest or to leave."""
 LEG_HOLD = {"Hip": 0.05, "Knee": 0.05, "Ankle": 0.3}
+ARM_HOLD = {"Shoulder": 0.05, "Elbow": 0.05}
+PLANT_STEPS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,8 @@ class Contacts:
 
     down: np.ndarray
     """(T, 2, 2) whether left, right foot's heel, ball is in contact."""
+    stays: np.ndarray
+    """(T - 1, 2, 2) whether it stays in its place from a frame to the next."""
 
     @property
     def foot(self) -> np.ndarray:
@@ -87,6 +93,11 @@ class Soles:
             middle.append([heel, ball])
         self.middle = middle
         self.feet = np.concatenate([np.concatenate(s) for s in self.sets])
+        self.arms = [
+            np.flatnonzero(np.isin(chain.surface_link, [chain.index[n] for n in links]))
+            for links in (chain.body.subtree(side + "Elbow") for side in SIDES)
+        ]
+        """Points of each forearm and hand."""
 
     def heights(self, surface: np.ndarray) -> np.ndarray:
         """(T, 2, 2) height of the lowest point of each part, from heights (T, S) of all points."""
@@ -108,19 +119,20 @@ def find_contacts(chain: Chain, frames: Frames, fps: float) -> Contacts:
     soles = Soles(chain)
     surface = chain.heights(frames)
     height, place = soles.heights(surface), soles.places(frames)
-    speed = np.linalg.norm(np.gradient(place, 1 / fps, axis=0), axis=-1)
+    step = np.linalg.norm(np.diff(place, axis=0), axis=-1) * fps
+    # The slower of the steps before and after: a sprinter's foot stands for four frames.
+    slow = step < SLOW
+    down = np.concatenate([slow[:1], slow]) | np.concatenate([slow, slow[-1:]])
     reach = 2 * round(AROUND * fps) + 1
     base = minimum_filter1d(height.min((1, 2)), reach, mode="nearest")
-    down = speed < SLOW
-    down &= height < base[:, None, None] + LOW
-    down &= height < surface.min(1)[:, None, None] + LOWEST
-    gap = np.ones(max(2, round(0.05 * fps)), dtype=bool)
-    for foot in range(2):
-        for part in range(2):
-            closed = binary_closing(np.pad(down[:, foot, part], 9, mode="edge"), gap)[9:-9]
-            long = binary_opening(np.pad(closed, 9, mode="edge"), gap)[9:-9]
-            down[:, foot, part] = long & (height[:, foot, part] < base + 2 * LOW)
-    return Contacts(down)
+    low = height < base[:, None, None] + LOW
+    low &= height < surface.min(1)[:, None, None] + LOWEST
+    down &= low
+    gap = np.ones((max(2, round(0.05 * fps)), 1, 1), dtype=bool)
+    closed = binary_closing(np.pad(down, ((9, 9), (0, 0), (0, 0)), mode="edge"), gap)[9:-9]
+    slowish = np.concatenate([step[:1], step]) < FAST
+    down |= closed & low & slowish
+    return Contacts(down, down[1:] & down[:-1] & (step < FAST))
 
 
 def ground(
@@ -128,10 +140,10 @@ def ground(
 ) -> Grounded:
     """Puts a motion (T frames, z up, any height) on the floor z = 0."""
     soles = Soles(chain)
+    local = _level_toes(chain, chain.frames(root, local), local, fps)
     frames = chain.frames(root, local)
     contacts = find_contacts(chain, frames, fps)
-    local = _level_toes(chain, soles, frames, local, fps)
-    surface = chain.heights(chain.frames(root, local))
+    surface = chain.heights(frames)
     moved = _move(soles, surface, contacts, fps)
     root = root + moved[:, None] * np.array([0.0, 0.0, 1.0])
     for _ in range(passes):
@@ -152,7 +164,7 @@ def _move(soles: Soles, surface: np.ndarray, contacts: Contacts, fps: float) -> 
     else:
         move = np.full(len(height), -np.percentile(surface.min(1), 2))
     others = np.ones(surface.shape[1], dtype=bool)
-    others[soles.feet] = False
+    others[np.concatenate([soles.feet, *soles.arms])] = False  # they have limbs to give way
     sunk = np.maximum(0.0, -(surface[:, others].min(1) + move))
     return move + _cover(sunk, fps)
 
@@ -164,17 +176,14 @@ def _cover(need: np.ndarray, fps: float) -> np.ndarray:
     return np.maximum(need, gaussian_filter1d(wide, width, mode="nearest", truncate=2.0))
 
 
-def _level_toes(
-    chain: Chain, soles: Soles, frames: Frames, local: np.ndarray, fps: float
-) -> np.ndarray:
+def _level_toes(chain: Chain, frames: Frames, local: np.ndarray, fps: float) -> np.ndarray:
     """Bends toes up where a foot rolls over them, instead of into the floor."""
-    height = soles.heights(chain.heights(frames))
-    base = minimum_filter1d(height.min((1, 2)), 2 * round(AROUND * fps) + 1, mode="nearest")
+    toes = [chain.index[side + "Toe"] for side in SIDES]
+    joint = frames.origin[:, toes, 2]
+    floor = minimum_filter1d(joint.min(1), 2 * round(AROUND * fps) + 1, mode="nearest")
     local = local.copy()
-    for foot, side in enumerate(SIDES):
-        toe = chain.index[side + "Toe"]
-        joint = frames.origin[:, toe, 2] - base
-        near = np.clip(2.0 - joint / 0.06, 0.0, 1.0)
+    for toe, height in zip(toes, joint.T):
+        near = np.clip(2.0 - (height - floor) / 0.06, 0.0, 1.0)
         down = np.arcsin(np.clip(-frames.turn[:, toe, 2, 0], -1, 1))
         upright = frames.turn[:, toe, 2, 2] > 0.2  # not for a foot on its back
         bend = np.clip(down - 0.05, 0.0, 1.0) * near * upright
@@ -190,13 +199,16 @@ def _plant(
     contacts: Contacts,
     fps: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Legs bent so that soles in contact are on the floor and stay in place."""
+    """Legs bent so that soles in contact are on the floor and stay in place; arms lifted out of
+    the floor."""
     frames = chain.frames(root, local)
-    height = soles.heights(chain.heights(frames))
-    place = soles.places(frames)
+    surface = chain.heights(frames)
+    height, place = soles.heights(surface), soles.places(frames)
     targets, weights, hold = {}, {}, {}
     for foot, side in enumerate(SIDES):
-        shift = _correction(height[:, foot], place[:, foot], contacts.down[:, foot], fps)
+        shift = _correction(
+            height[:, foot], place[:, foot], contacts.down[:, foot], contacts.stays[:, foot], fps
+        )
         for joint in ("Ankle", "Toe"):
             name = side + joint
             targets[name] = frames.origin[:, chain.index[name]] + shift
@@ -204,11 +216,19 @@ def _plant(
         targets[side + "Knee"] = frames.origin[:, chain.index[side + "Knee"]]
         weights[side + "Knee"] = 0.1  # the leg keeps its plane
         hold |= {side + joint: value for joint, value in LEG_HOLD.items()}
-    return fit(chain, root, local, Aim(targets, weights, hold, hold_root=5.0), steps=3)
+        sunk = _cover(np.maximum(0.0, -surface[:, soles.arms[foot]].min(1)), fps)
+        if sunk.any():
+            for joint, weight in (("Elbow", 1.0), ("Wrist", 10.0)):
+                name = side + joint
+                up = sunk[:, None] * np.array([0.0, 0.0, 1.0])
+                targets[name] = frames.origin[:, chain.index[name]] + up
+                weights[name] = weight
+            hold |= {side + joint: value for joint, value in ARM_HOLD.items()}
+    return fit(chain, root, local, Aim(targets, weights, hold, hold_root=5.0), steps=PLANT_STEPS)
 
 
 def _correction(
-    height: np.ndarray, place: np.ndarray, down: np.ndarray, fps: float
+    height: np.ndarray, place: np.ndarray, down: np.ndarray, stays: np.ndarray, fps: float
 ) -> np.ndarray:
     """(T, 3) by how much a foot must be moved: heights and places of heel and ball (T, 2, ...)."""
     frames = len(height)
@@ -218,15 +238,19 @@ def _correction(
     edges = np.flatnonzero(np.diff(np.concatenate([[0], known.astype(int), [0]])))
     spans = list(zip(edges[::2], edges[1::2]))
     for first, last in spans:
-        both = down[first : last - 1] & down[first + 1 : last]
+        both = stays[first : last - 1]
         step = np.diff(place[first:last, :, :2], axis=0)
-        count = np.maximum(both.sum(1), 1)[:, None]
-        slide = np.cumsum((step * both[..., None]).sum(1) / count, axis=0)
+        step = (step * both[..., None]).sum(1) / np.maximum(both.sum(1), 1)[:, None]
+        # Feet come to rest and leave over a moment, as they do.
+        edge = np.minimum(np.arange(1, last - first), np.arange(last - first - 1, 0, -1))
+        step *= np.minimum(1.0, edge / max(1.0, EASE * fps))[:, None]
+        slide = np.cumsum(step, axis=0)
         slide = np.concatenate([np.zeros((1, 2)), slide])
         slide -= slide.mean(0)
         far = np.linalg.norm(slide, axis=1).max()
         shift[first:last, :2] = -slide * min(1.0, SLIDE / max(far, 1e-9))
     shift = _bridge(shift, spans, round(BLEND * fps))
+    shift = gaussian_filter1d(shift, EASE / 2 * fps, axis=0, mode="nearest")
     sunk = np.maximum(0.0, -(height.min(1) + shift[:, 2]))
     shift[:, 2] += np.where(known, 0.0, _cover(sunk, fps))
     return shift

@@ -127,7 +127,7 @@ def measure(
     height = np.where(contacts.down, soles.heights(surface), np.inf).min(2)[contacts.foot]
     place = soles.places(frames)[..., :2]
     slide = np.linalg.norm(np.diff(place, axis=0), axis=-1) * fps
-    stays = contacts.down[:-1] & contacts.down[1:]
+    stays = contacts.stays
     joints, source = np.stack(list(ours.values()), 1), np.stack(list(targets.values()), 1)
     low = surface.min(1)
     speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1) * fps
