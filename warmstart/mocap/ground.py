@@ -19,8 +19,8 @@ from scipy.ndimage import (
 )
 
 from warmstart.mocap.capture import SIDES
-from warmstart.mocap.fit import Aim, fit
 from warmstart.mocap.kinematics import Chain, Frames, exp
+from warmstart.mocap.limbs import move_end, stretch
 
 SLOW, FAST = 0.3, 0.7
 """A part of a sole in contact stands when it moves at less than the first (m/s), and leaves its
@@ -39,9 +39,9 @@ SLIDE = 0.15
 """A contact that slides further than this (m) is left to slide by the rest."""
 EASE = 0.05
 """A foot takes this long (s) to come to rest or to leave."""
-LEG_HOLD = {"Hip": 0.05, "Knee": 0.05, "Ankle": 0.3}
-ARM_HOLD = {"Shoulder": 0.05, "Elbow": 0.05}
-PLANT_STEPS = 5
+LOWERED = 0.03
+"""The hips come down by at most this (m) in one pass for a foot out of reach."""
+UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +145,12 @@ def ground(
     contacts = find_contacts(chain, frames, fps)
     surface = chain.heights(frames)
     moved = _move(soles, surface, contacts, fps)
-    root = root + moved[:, None] * np.array([0.0, 0.0, 1.0])
+    root = root + moved[:, None] * UP
     for _ in range(passes):
         root, local = _plant(chain, soles, root, local, contacts, fps)
     low = chain.heights(chain.frames(root, local)).min(1)
     rest = _cover(np.maximum(0.0, -0.005 - low), fps)
-    root = root + rest[:, None] * np.array([0.0, 0.0, 1.0])
+    root = root + rest[:, None] * UP
     return Grounded(root, local, contacts, moved + rest)
 
 
@@ -204,27 +204,26 @@ def _plant(
     frames = chain.frames(root, local)
     surface = chain.heights(frames)
     height, place = soles.heights(surface), soles.places(frames)
-    targets, weights, hold = {}, {}, {}
+    local = local.copy()
+    lower = np.zeros(len(root))
+    moves = []
     for foot, side in enumerate(SIDES):
+        leg = (side + "Hip", side + "Knee", side + "Ankle")
         shift = _correction(
             height[:, foot], place[:, foot], contacts.down[:, foot], contacts.stays[:, foot], fps
         )
-        for joint in ("Ankle", "Toe"):
-            name = side + joint
-            targets[name] = frames.origin[:, chain.index[name]] + shift
-            weights[name] = 10.0
-        targets[side + "Knee"] = frames.origin[:, chain.index[side + "Knee"]]
-        weights[side + "Knee"] = 0.1  # the leg keeps its plane
-        hold |= {side + joint: value for joint, value in LEG_HOLD.items()}
+        moves.append((leg, np.array([0.0, 1.0, 0.0]), shift))
+        lower = np.maximum(lower, stretch(chain, frames, leg, shift) * contacts.foot[:, foot])
         sunk = _cover(np.maximum(0.0, -surface[:, soles.arms[foot]].min(1)), fps)
         if sunk.any():
-            for joint, weight in (("Elbow", 1.0), ("Wrist", 10.0)):
-                name = side + joint
-                up = sunk[:, None] * np.array([0.0, 0.0, 1.0])
-                targets[name] = frames.origin[:, chain.index[name]] + up
-                weights[name] = weight
-            hold |= {side + joint: value for joint, value in ARM_HOLD.items()}
-    return fit(chain, root, local, Aim(targets, weights, hold, hold_root=5.0), steps=PLANT_STEPS)
+            arm = (side + "Shoulder", side + "Elbow", side + "Wrist")
+            hinge = np.array([0.0, 0.0, -1.0 if side == "L_" else 1.0])
+            moves.append((arm, hinge, sunk[:, None] * UP))
+    # The hips come down a little where a leg is too short for what is asked of it.
+    down = np.minimum(_cover(lower, fps), LOWERED)[:, None] * UP
+    for limb, hinge, shift in moves:
+        move_end(chain, frames, local, limb, hinge, shift + (down if limb[0].endswith("Hip") else 0))
+    return root - down, local
 
 
 def _correction(
@@ -234,7 +233,7 @@ def _correction(
     frames = len(height)
     shift = np.zeros((frames, 3))
     known = down.any(1)
-    shift[known, 2] = -np.where(down, height, np.inf).min(1)[known]
+    shift[known, 2] = -height.min(1)[known]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], known.astype(int), [0]])))
     spans = list(zip(edges[::2], edges[1::2]))
     for first, last in spans:
@@ -252,7 +251,11 @@ def _correction(
     shift = _bridge(shift, spans, round(BLEND * fps))
     shift = gaussian_filter1d(shift, EASE / 2 * fps, axis=0, mode="nearest")
     sunk = np.maximum(0.0, -(height.min(1) + shift[:, 2]))
-    shift[:, 2] += np.where(known, 0.0, _cover(sunk, fps))
+    inside = np.zeros(frames)  # 0 at the edges of a contact, 1 a moment within
+    for first, last in spans:
+        edge = np.minimum(np.arange(1, last - first + 1), np.arange(last - first, 0, -1))
+        inside[first:last] = np.minimum(1.0, edge / max(1.0, EASE * fps))
+    shift[:, 2] += (1.0 - inside) * _cover(sunk, fps)
     return shift
 
 
