@@ -18,8 +18,8 @@ from scipy.ndimage import (
     minimum_filter1d,
 )
 
-from warmstart.mocap.capture import SIDES
-from warmstart.mocap.kinematics import Chain, Frames, exp
+from warmstart.mocap.capture import SIDES, unit
+from warmstart.mocap.kinematics import Chain, Frames, exp, log, swing
 from warmstart.mocap.limbs import move_end, stretch
 
 SLOW, FAST = 0.3, 0.7
@@ -41,6 +41,8 @@ EASE = 0.05
 """A foot takes this long (s) to come to rest or to leave."""
 LOWERED = 0.03
 """The hips come down by at most this (m) in one pass for a foot out of reach."""
+WRIST = 1.4
+"""Largest turn of a wrist that keeps fingers out of the floor (rad)."""
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -98,6 +100,16 @@ class Soles:
             for links in (chain.body.subtree(side + "Elbow") for side in SIDES)
         ]
         """Points of each forearm and hand."""
+        self.hands = []
+        """(length, half thickness) of each hand beyond the wrist (m)."""
+        for side in SIDES:
+            links = [chain.index[name] for name in chain.body.subtree(side + "Wrist")]
+            on = np.isin(chain.surface_link, links)
+            place = chain.rest[chain.surface_link[on]] - chain.rest[links[0]]
+            place = place + chain.surface_point[on]
+            length = float((np.abs(place[:, 1]) + chain.surface_radius[on]).max())
+            low = float((chain.surface_radius[on] - place[:, 2]).max())
+            self.hands.append((length, low))
 
     def heights(self, surface: np.ndarray) -> np.ndarray:
         """(T, 2, 2) height of the lowest point of each part, from heights (T, S) of all points."""
@@ -146,6 +158,7 @@ def ground(
     surface = chain.heights(frames)
     moved = _move(soles, surface, contacts, fps)
     root = root + moved[:, None] * UP
+    local = _level_hands(chain, soles, chain.frames(root, local), local)
     for _ in range(passes):
         root, local = _plant(chain, soles, root, local, contacts, fps)
     low = chain.heights(chain.frames(root, local)).min(1)
@@ -188,6 +201,27 @@ def _level_toes(chain: Chain, frames: Frames, local: np.ndarray, fps: float) -> 
         upright = frames.turn[:, toe, 2, 2] > 0.2  # not for a foot on its back
         bend = np.clip(down - 0.05, 0.0, 1.0) * near * upright
         local[:, toe] = local[:, toe] @ exp(-bend[:, None] * np.array([0.0, 1.0, 0.0]))
+    return local
+
+
+def _level_hands(chain: Chain, soles: Soles, frames: Frames, local: np.ndarray) -> np.ndarray:
+    """Bends wrists where fingers would point into the floor, as far as is needed.
+
+    Fingers turn the way they point already, or to the back of the hand when they point down.
+    """
+    local = local.copy()
+    for side, sign, (length, depth) in zip(SIDES, (1.0, -1.0), soles.hands):
+        wrist, elbow = chain.index[side + "Wrist"], chain.index[side + "Elbow"]
+        turn = frames.turn[:, wrist]
+        fingers, back = sign * turn[:, :, 1], turn[:, :, 2]
+        room = np.clip((frames.origin[:, wrist, 2] - depth) / length, 0.0, 1.0)
+        over = fingers * (1 - UP) + 0.6 * back * (1 - UP)
+        down = np.maximum(fingers[:, 2], -room)[:, None]
+        goal = unit(over) * np.sqrt(np.maximum(0.0, 1 - down**2)) + down * UP
+        bend = np.where((fingers[:, 2] < -room)[:, None], log(swing(fingers, unit(goal))), 0.0)
+        size = np.linalg.norm(bend, axis=1, keepdims=True)
+        bend *= np.minimum(1.0, WRIST / np.maximum(size, 1e-9))
+        local[:, wrist] = np.swapaxes(frames.turn[:, elbow], 1, 2) @ exp(bend) @ turn
     return local
 
 

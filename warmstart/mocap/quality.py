@@ -34,8 +34,10 @@ class Limits:
     """Share of frames with a point more than 2 cm under the floor."""
     skating: float = 0.15
     """Mean horizontal speed of soles in contact (m/s)."""
-    jerk: float = 5000.0
+    jerk: float = 20000.0
     """95th percentile of the third derivative of joint positions (m/s^3)."""
+    jerk_added: float = 3000.0
+    """By how much it exceeds the source's (m/s^3)."""
     unevenness: float = 0.35
     """Range of the move that brings the feet to one floor (m): stairs, boxes, slopes."""
     speed: float = 25.0
@@ -89,6 +91,7 @@ class Quality:
             ("{:.1f} % of frames under the floor", self.sunk_frames, limits.sunk_frames, 100),
             ("feet slide at {:.0f} cm/s", self.skating, limits.skating, 100),
             ("jerk of {:.0f} m/s^3", self.jerk, limits.jerk, 1),
+            ("{:.0f} m/s^3 jerkier", self.jerk - self.jerk_source, limits.jerk_added, 1),
             ("floor uneven by {:.0f} cm", self.moved, limits.unevenness, 100),
             ("a joint at {:.0f} m/s", self.speed, limits.speed, 1),
         )
