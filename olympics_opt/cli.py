@@ -260,12 +260,15 @@ COMMANDS: dict[str, Command] = {
     "render": Command(Render, "olympics_opt.play:run_render", "task"),
     "play": Command(Play, "olympics_opt.viewer:run_play", "task"),
     "study": Command(Study, "olympics_opt.study:run_study"),
+    "mocap": Command(
+        None, "olympics_opt.mocap:main", summary="Make clips of recorded motions of people."
+    ),
     "bench": Command(
         None, "olympics_opt.bench:main", summary="Measure physics, environment and training speed."
     ),
     "leaderboard": Command(Leaderboard, "olympics_opt.catalogue:run_leaderboard"),
 }
-LATER = ("mocap",)
+LATER: tuple[str, ...] = ()
 """Commands of later versions: not listed, refused with a sentence."""
 USER_ERRORS = (ValueError, RuntimeError, OSError, ImportError)
 

@@ -90,7 +90,9 @@ def _of_path(path: Path) -> Iterator[Recording]:
             yield from _of_archive(file, facts)
         elif file.suffix.lower() in SUFFIXES:
             row = facts.get(name, facts.get(f"{path.name}/{name}", {}))
-            yield Recording(path.name, name, read_file(file), skeletons, row)
+            data = read_file(file)
+            if _is_motion(name, data):
+                yield Recording(path.name, name, data, skeletons, row)
 
 
 def _of_archive(path: Path, facts: Mapping[str, Mapping[str, str]]) -> Iterator[Recording]:
@@ -102,10 +104,15 @@ def _of_archive(path: Path, facts: Mapping[str, Mapping[str, str]]) -> Iterator[
         raise ValueError(f"{path} is a damaged archive: {text[0] if text else 'cut off'}") from error
     skeletons = {name: data for name, data in members.items() if name.lower().endswith(".asf")}
     for name in sorted(members):
-        if name.lower().endswith(SUFFIXES):
+        if name.lower().endswith(SUFFIXES) and _is_motion(name, members[name]):
             short = name.removeprefix(f"{label}/")
             row = facts.get(name, facts.get(f"{label}/{short}", {}))
             yield Recording(label, short, members[name], skeletons, row)
+
+
+def _is_motion(name: str, data: bytes) -> bool:
+    """Whether a file among others is meant: a text or JSON file may be about anything."""
+    return not name.lower().endswith((".txt", ".json")) or b'"Frames"' in data
 
 
 def _members(path: Path) -> Iterator[tuple[str, bytes]]:
@@ -138,7 +145,7 @@ def _members(path: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def _room(path: Path, total: int, size: int) -> int:
-    if size > MAX_BYTES or total + size > 16 * MAX_BYTES:
+    if size > MAX_BYTES or total + size > 8 * MAX_BYTES:
         raise ValueError(f"{path} unpacks to more than is sensible ({(total + size) / 2**20:.0f} MiB)")
     return total + size
 
