@@ -28,7 +28,7 @@ STEPS = 4
 class Aim:
     """What a fit minimises, as sums of squares.
 
-    ``sum w_j^2 |p_j - target_j|^2 + sum h_i^2 |log(guess_i^T local_i)|^2``: joints near their
+    ``sum w_j^2 |p_j - target_j|^2 + sum |h_i log(guess_i^T local_i)|^2``: joints near their
     targets, and every link near its first guess against its parent. At a first guess that meets the
     targets both are zero, whatever the weights.
     """
@@ -37,8 +37,8 @@ class Aim:
     """Joint -> (T, 3) m."""
     weights: Mapping[str, float]
     """Joint -> weight (1 = one metre counts one)."""
-    hold: Mapping[str, float]
-    """Link -> weight of its guess (per rad); links that are left out do not move."""
+    hold: Mapping[str, float | tuple[float, float, float]]
+    """Link -> weight of its guess (per rad), also by axis; links that are left out do not move."""
     hold_root: float = 0.0
     """Weight of the root's guessed place (per m)."""
 
@@ -71,7 +71,8 @@ class _Plan:
         self.joints = np.array([chain.index[name] for name in self.names])
         self.weight = np.array([aim.weights[name] for name in self.names])
         self.links = np.array([chain.index[name] for name in aim.hold])
-        self.hold = np.array(list(aim.hold.values()))
+        self.hold = np.array([np.broadcast_to(h, 3) for h in aim.hold.values()], dtype=float)
+        """(L, 3)"""
         self.hold_root = aim.hold_root
         column = {link: k for k, link in enumerate(self.links)}
         pairs = [
@@ -118,7 +119,7 @@ class _Problem:
         frames = plan.chain.frames(root, local)
         error = (self.target - frames.origin[:, plan.joints]) * plan.weight[:, None]
         away = log(np.swapaxes(self.guess_local, -1, -2) @ local[:, plan.links])
-        cost = (error**2).sum((1, 2)) + ((plan.hold[:, None] * away) ** 2).sum((1, 2))
+        cost = (error**2).sum((1, 2)) + ((plan.hold * away) ** 2).sum((1, 2))
         cost += plan.hold_root**2 * ((root - self.guess_root) ** 2).sum(1)
         return cost, error, away, frames
 
@@ -128,7 +129,7 @@ class _Problem:
         jacobian = plan.jacobian(self.frames)
         normal = np.swapaxes(jacobian, 1, 2) @ jacobian
         slope = (np.swapaxes(jacobian, 1, 2) @ self.error.reshape(count, -1, 1))[..., 0]
-        stiff = np.repeat(plan.hold**2, 3)
+        stiff = (plan.hold**2).ravel()
         slope[:, 3:] -= stiff * self.away.reshape(count, -1)
         slope[:, :3] -= plan.hold_root**2 * (self.best_root - self.guess_root)
         index = np.arange(plan.width)

@@ -20,7 +20,7 @@ from scipy.ndimage import (
 
 from warmstart.mocap.capture import SIDES, unit
 from warmstart.mocap.kinematics import Chain, Frames, exp, log, swing
-from warmstart.mocap.limbs import move_end, stretch
+from warmstart.mocap.limbs import limb_of, move_end, stretch
 
 SLOW, FAST = 0.3, 0.7
 """A part of a sole in contact stands when it moves at less than the first (m/s), and leaves its
@@ -242,21 +242,19 @@ def _plant(
     lower = np.zeros(len(root))
     moves = []
     for foot, side in enumerate(SIDES):
-        leg = (side + "Hip", side + "Knee", side + "Ankle")
+        leg = limb_of(side, "leg")
         shift = _correction(
             height[:, foot], place[:, foot], contacts.down[:, foot], contacts.stays[:, foot], fps
         )
-        moves.append((leg, np.array([0.0, 1.0, 0.0]), shift))
+        moves.append((leg, shift))
         lower = np.maximum(lower, stretch(chain, frames, leg, shift) * contacts.foot[:, foot])
         sunk = _cover(np.maximum(0.0, -surface[:, soles.arms[foot]].min(1)), fps)
         if sunk.any():
-            arm = (side + "Shoulder", side + "Elbow", side + "Wrist")
-            hinge = np.array([0.0, 0.0, -1.0 if side == "L_" else 1.0])
-            moves.append((arm, hinge, sunk[:, None] * UP))
+            moves.append((limb_of(side, "arm"), sunk[:, None] * UP))
     # The hips come down a little where a leg is too short for what is asked of it.
     down = np.minimum(_cover(lower, fps), LOWERED)[:, None] * UP
-    for limb, hinge, shift in moves:
-        move_end(chain, frames, local, limb, hinge, shift + (down if limb[0].endswith("Hip") else 0))
+    for limb, shift in moves:
+        move_end(chain, frames, local, limb, shift + (down if limb[0].endswith("Hip") else 0.0))
     return root - down, local
 
 

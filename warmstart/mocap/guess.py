@@ -16,6 +16,7 @@ import numpy as np
 
 from warmstart.mocap.capture import KEY_JOINTS, SIDES, Capture, unit
 from warmstart.mocap.kinematics import Chain, exp, log, nearest_rotation, swing
+from warmstart.mocap.limbs import bend_for, hinge_of, limb_of
 
 BENT = 0.25
 """A limb shows its plane from this sine of its bend on; below, its twist is carried over."""
@@ -117,36 +118,44 @@ class _Guesser:
 
     def _limbs(self) -> None:
         for side in SIDES:
-            # Bending turns the shin about +y of the thigh, the forearm about -z (left), +z (right)
-            # of the upper arm: the axis of a limb's plane is first bone x second bone.
-            out = -1.0 if side == "L_" else 1.0
-            limbs = (
-                ("Hip", "Knee", "Ankle", "Pelvis", np.array([0.0, 1.0, 0.0])),
-                ("Shoulder", "Elbow", "Wrist", "Chest", np.array([0.0, 0.0, out])),
-            )
-            for first, second, third, parent, hinge in limbs:
-                self._limb(side + first, side + second, side + third, parent, hinge)
+            self._limb(limb_of(side, "leg"), "Pelvis")
+            self._limb(limb_of(side, "arm"), "Chest")
             self._foot(side)
             hand = side + "Wrist"
             self.turn[hand] = self._bend(hand, self.turn[side + "Elbow"])
 
-    def _limb(self, a: str, b: str, c: str, parent: str, hinge: np.ndarray) -> None:
-        """Both links of a leg or an arm, and the targets of its joints."""
+    def _limb(self, limb: tuple[str, str, str], parent: str) -> None:
+        """Both links of a leg or an arm, and the targets of its joints.
+
+        The second link turns about its hinge alone: twist that a source has there is its hand's or
+        foot's. The end of the limb is met, the middle up to a centimetre or two: our bones do not
+        lie in the plane that the hinge turns in.
+        """
+        a, b, c = limb
         upper, lower = self._bone(a, b), self._bone(b, c)
+        first, second = self.chain.length(a, b), self.chain.length(b, c)
+        self.targets[b] = self.targets[a] + first * upper
+        self.targets[c] = self.targets[b] + second * lower
+        hinge = hinge_of(b)
+        bones = self.rest[b] - self.rest[a], self.rest[c] - self.rest[b]
+        reach = first * upper + second * lower
+        bend, _ = bend_for(*bones, hinge, np.linalg.norm(reach, axis=1))
+        bent = exp(bend[:, None] * hinge)
+        span = unit(bones[0] + bent @ bones[1])
+        reach = unit(reach)
+        # First bone x second bone is the axis of the limb's plane.
         normal = np.cross(upper, lower)
         sure = np.clip(np.linalg.norm(normal, axis=1) / BENT - 0.5, 0.0, 1.0)
-        for link, bone, child in ((a, upper, b), (b, lower, c)):
-            rest_bone = self._rest_bone(link, child)
-            plain = _frame(np.where(sure[:, None] > 0, normal, hinge), bone)
-            plain = plain @ _frame(hinge, rest_bone).T
-            if link in self.capture.turns:
-                turn = self._follow(link, plain, sure)
-            else:
-                turn = self._twist(self.turn[parent], rest_bone, bone, plain, sure)
-            self.turn[link] = self._aligned(turn, rest_bone, bone)
-            parent = link
-        self.targets[b] = self.targets[a] + self.chain.length(a, b) * upper
-        self.targets[c] = self.targets[b] + self.chain.length(b, c) * lower
+        across = np.where(sure[:, None] > 0, normal, self.turn[parent] @ hinge)
+        plain = _frame(across, reach) @ np.swapaxes(
+            _frame(np.broadcast_to(hinge, span.shape), span), 1, 2
+        )
+        if a in self.capture.turns:
+            turn = self._follow(a, plain, sure)
+        else:
+            turn = self._twist(self.turn[parent], span, reach, plain, sure)
+        self.turn[a] = self._aligned(turn, span, reach)
+        self.turn[b] = self.turn[a] @ bent
 
     def _foot(self, side: str) -> None:
         """The foot's link and toe; its pitch is set so that a foot that rests is flat."""
@@ -212,7 +221,8 @@ class _Guesser:
 
     def _aligned(self, turn: np.ndarray, rest_bone: np.ndarray, bone: np.ndarray) -> np.ndarray:
         """The smallest further turn that points the link's bone the right way."""
-        return swing(turn @ rest_bone, bone) @ turn
+        now = (turn @ np.broadcast_to(rest_bone, bone.shape)[..., None])[..., 0]
+        return swing(now, bone) @ turn
 
     def _twist(
         self,
@@ -224,7 +234,7 @@ class _Guesser:
     ) -> np.ndarray:
         """Without rotations of the source: twist from the limb's plane, held while it is straight."""
         swung = self._aligned(parent, rest_bone, bone)
-        twist = (log(np.swapaxes(swung, 1, 2) @ plain) * rest_bone).sum(1)
+        twist = (log(np.swapaxes(swung, 1, 2) @ plain) * rest_bone).sum(-1)
         known = np.flatnonzero(sure > 0.5)
         if len(known) == 0:
             return swung

@@ -20,6 +20,12 @@ from warmstart.mocap.quality import Quality, measure
 
 HOLD = 0.05
 """Weight of a link's first guess in the fit (m of joint error per rad)."""
+HINGED = {
+    **{f"{side}_Knee": (0.5, HOLD, 0.5) for side in "LR"},
+    **{f"{side}_Elbow": (0.5, 0.5, HOLD) for side in "LR"},
+}
+"""Knees and elbows keep to their hinge: near 90 degrees of flexion of a knee, whose hinge is the
+middle one, anything else would spin the other two."""
 NOISY = ("TRAM", "WHAM", "GVHMR")
 """Layouts of video tools, whose motions are smoothed."""
 CUTOFF = 6.0
@@ -54,8 +60,8 @@ def retarget(
     capture = without_t_pose(capture)
     fps = capture.fps
     guess = first_guess(chain, capture)
-    weights = {name: 1.0 for name in KEY_JOINTS}
-    hold = {name: HOLD for name in chain.names if name in _MOVING}
+    weights = {name: 0.5 if name in HINGED else 1.0 for name in KEY_JOINTS}
+    hold = {name: HINGED.get(name, (HOLD,) * 3) for name in chain.names if name in _MOVING}
     root, local = fit(chain, guess.root, chain.local(guess.turn), Aim(guess.targets, weights, hold))
     if cutoff is None and capture.meta.get("layout") in NOISY:
         cutoff = CUTOFF
