@@ -20,12 +20,15 @@ from warmstart.mocap.quality import Quality, measure
 
 HOLD = 0.05
 """Weight of a link's first guess in the fit (m of joint error per rad)."""
+STIFF = 100.0
 HINGED = {
-    **{f"{side}_Knee": (0.5, HOLD, 0.5) for side in "LR"},
-    **{f"{side}_Elbow": (0.5, 0.5, HOLD) for side in "LR"},
+    **{f"{side}_Knee": (STIFF, HOLD, STIFF) for side in "LR"},
+    **{f"{side}_Elbow": (STIFF, STIFF, HOLD) for side in "LR"},
 }
 """Knees and elbows keep to their hinge: near 90 degrees of flexion of a knee, whose hinge is the
 middle one, anything else would spin the other two."""
+SINGULAR = 1e-5
+"""Cosine of a joint's middle hinge below which its other two are not told apart."""
 NOISY = ("TRAM", "WHAM", "GVHMR")
 """Layouts of video tools, whose motions are smoothed."""
 CUTOFF = 6.0
@@ -130,25 +133,29 @@ def hinge_angles(body: Body, local: np.ndarray) -> np.ndarray:
     run on through the singular pose; whole turns beyond the joint's range are taken back.
     """
     r = local[:, 1:]
-    y = np.arcsin(np.clip(r[..., 0, 2], -1, 1))
-    # At the singular pose only the sum or difference of x and z counts: z is then left at zero.
-    flat = np.hypot(r[..., 0, 0], r[..., 0, 1]) < 1e-7
-    x = np.where(
-        flat,
-        np.arctan2(r[..., 2, 1], r[..., 1, 1]),
-        np.arctan2(-r[..., 1, 2], r[..., 2, 2]),
-    )
-    z = np.where(flat, 0.0, np.arctan2(-r[..., 0, 1], r[..., 0, 0]))
+    flat = np.hypot(r[..., 0, 0], r[..., 0, 1])
+    y = np.arctan2(r[..., 0, 2], flat)
+    x, z = np.arctan2(-r[..., 1, 2], r[..., 2, 2]), np.arctan2(-r[..., 0, 1], r[..., 0, 0])
     one = np.stack([x, y, z], axis=-1)
     two = np.stack([x + np.pi, np.pi - y, z + np.pi], axis=-1)
     both = np.stack([one, two], axis=-2)
+    # At the singular pose only x + z counts (y = 90 degrees) or x - z (-90): the rest is kept.
+    singular = flat < SINGULAR
+    sense = np.sign(r[..., 0, 2])
+    total = np.arctan2(sense * r[..., 2, 1], r[..., 1, 1])
     turn = 2 * np.pi
     out = np.empty_like(one)
     last = np.zeros(one.shape[1:])
     for t in range(len(one)):
         near = both[t] - turn * np.round((both[t] - last[:, None]) / turn)
         pick = np.abs(near - last[:, None]).sum(-1).argmin(-1)
-        last = out[t] = np.take_along_axis(near, pick[:, None, None], axis=1)[:, 0]
+        now = np.take_along_axis(near, pick[:, None, None], axis=1)[:, 0]
+        for j in np.flatnonzero(singular[t]):
+            s = sense[t, j]
+            off = s * total[t, j] - (last[j, 0] + s * last[j, 2])
+            off -= turn * np.round(off / turn)
+            now[j] = last[j, 0] + off / 2, now[j, 1], last[j, 2] + s * off / 2
+        last = out[t] = now
     lower = body.array("lower").reshape(-1, 3)
     upper = body.array("upper").reshape(-1, 3)
     out -= turn * np.ceil(np.maximum(0.0, out - upper) / turn - 1e-12)
