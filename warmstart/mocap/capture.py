@@ -29,6 +29,8 @@ LEG = (0.4, 1.3)
 FPS = (5.0, 1000.0)
 """Lowest and highest frame rate of a recording."""
 MAX_FRAMES = 400_000
+STRAIGHT = 0.966
+"""Cosine of the angle within which a limb counts as stretched in a T-pose: 15 degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +45,6 @@ class Capture:
     rest: Literal["t_pose", "unknown"] = "unknown"
     """``t_pose``: turns are the identity when the person stands in our zero pose. ``unknown``: each
     part has axes of its own, fixed in it."""
-    body: str | None = None
-    """The table of ours on whose bones the points lie exactly (files of SMPL parameters)."""
     meta: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -106,7 +106,7 @@ def unit(vector: np.ndarray) -> np.ndarray:
 def without_t_pose(capture: Capture) -> Capture:
     """The recording from the first frame on that is not the T-pose of a calibration.
 
-    A T-pose: both arms stretched sideways and both legs stretched, within about 15 degrees. Raises
+    A T-pose: both arms stretched sideways and both legs stretched, within 15 degrees. Raises
     ValueError when fewer than 2 frames are left.
     """
     p = capture.points
@@ -116,9 +116,9 @@ def without_t_pose(capture: Capture) -> Capture:
     for side, sign in zip(SIDES, (1.0, -1.0)):
         for a, b in (("Shoulder", "Elbow"), ("Elbow", "Wrist")):
             bone = unit(p[side + b] - p[side + a])
-            still &= sign * (bone * across).sum(1) > 0.93
+            still &= sign * (bone * across).sum(1) > STRAIGHT
         for a, b in (("Hip", "Knee"), ("Knee", "Ankle")):
-            still &= (unit(p[side + b] - p[side + a]) * down).sum(1) > 0.93
+            still &= (unit(p[side + b] - p[side + a]) * down).sum(1) > STRAIGHT
     first = capture.num_frames if still.all() else int(np.argmin(still))
     if first == 0:
         return capture

@@ -20,6 +20,8 @@ from warmstart.mocap.limbs import bend_for, hinge_of, limb_of
 
 BENT = 0.25
 """A limb shows its plane from this sine of its bend on; below, its twist is carried over."""
+OWN = 1e-4
+"""A skeleton is ours when its joints lie this near (m) where our bones would put them."""
 LEVEL = 0.12
 """A foot is taken to lie flat when it is this slow (m/s, scaled) and near its lowest."""
 
@@ -38,12 +40,24 @@ class Guess:
 
 
 def first_guess(chain: Chain, capture: Capture) -> Guess:
-    """Targets and a first pose of our body. An exact source (``capture.body``) is copied."""
-    if capture.body == chain.body.name:
-        turn = np.stack([capture.turns[name] for name in chain.names], axis=1)
-        points = {name: capture.points[name] for name in KEY_JOINTS}
-        return Guess(points, points, capture.points["Pelvis"], turn)
-    return _Guesser(chain, capture).guess()
+    """Targets and a first pose of our body. A source with our very bones is copied."""
+    turn = _own_turns(chain, capture)
+    if turn is None:
+        return _Guesser(chain, capture).guess()
+    points = {name: capture.points[name] for name in KEY_JOINTS}
+    return Guess(points, points, capture.points["Pelvis"], turn)
+
+
+def _own_turns(chain: Chain, capture: Capture) -> np.ndarray | None:
+    """(T, B, 3, 3) rotations of a source whose skeleton is our body; None for another skeleton."""
+    if capture.rest != "t_pose" or not set(chain.names) <= set(capture.turns):
+        return None
+    if not {"Pelvis", *KEY_JOINTS} <= set(capture.points):
+        return None
+    turn = np.stack([capture.turns[name] for name in chain.names], axis=1)
+    origin = chain.frames(capture.points["Pelvis"], chain.local(turn)).origin
+    off = [np.abs(origin[:, chain.index[n]] - capture.points[n]).max() for n in KEY_JOINTS]
+    return turn if max(off) < OWN else None
 
 
 class _Guesser:

@@ -109,7 +109,7 @@ def on_our_bones(
     frames = chain.frames(pelvis @ up.T, local)
     points = {name: frames.origin[:, i] for i, name in enumerate(chain.names)}
     turns = {name: frames.turn[:, i] for i, name in enumerate(chain.names)}
-    return Capture(fps, points, turns, "t_pose", body="smpl", meta=meta)
+    return Capture(fps, points, turns, "t_pose", meta)
 
 
 def _tram(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
