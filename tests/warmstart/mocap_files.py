@@ -98,12 +98,19 @@ def amass(qpos: np.ndarray, width: int = 72, fps: float = 30.0) -> bytes:
     full[:, :66] = pose[:, :66]
     if width == 72:
         full = pose
-    return npz(poses=full, trans=place - PELVIS, betas=np.zeros(16), mocap_framerate=fps, gender="neutral")
+    return npz(
+        poses=full, trans=place - PELVIS, betas=np.zeros(16), mocap_framerate=fps, gender="neutral"
+    )
 
 
 def amass_split(qpos: np.ndarray) -> bytes:
     pose, place = smpl_pose(qpos, z_up=True)
-    return npz(root_orient=pose[:, :3], pose_body=pose[:, 3:66], trans=place - PELVIS, mocap_frame_rate=60.0)
+    return npz(
+        root_orient=pose[:, :3],
+        pose_body=pose[:, 3:66],
+        trans=place - PELVIS,
+        mocap_frame_rate=60.0,
+    )
 
 
 def wham(qpos: np.ndarray) -> bytes:
@@ -139,7 +146,9 @@ def tram(qpos: np.ndarray, seed: int = 1) -> bytes:
 def bvh(qpos: np.ndarray, body: Body = BODY, order: str = "ZXY", unit: float = 0.01) -> str:
     """Our own skeleton as a BVH file, y up, z forward."""
     local, axes = rotations(qpos, body), Rotation.from_matrix(AXES)
-    children = {link.name: [c.name for c in body.links if c.parent == link.name] for link in body.links}
+    children = {
+        link.name: [c.name for c in body.links if c.parent == link.name] for link in body.links
+    }
     offset = {link.name: np.array(link.offset) @ AXES / unit for link in body.links}
     lines, columns = ["HIERARCHY"], []
 
@@ -179,8 +188,9 @@ def own_map(format: str, unit: float = 1.0) -> JointMap:
         name="own",
         format=format,
         joints=joints,
-        turns=None if format == "bvh" else {k: f"m_{k.lower()}" for k in BODY.link_names[1:]}
-        | {"Pelvis": "root"},
+        turns=None
+        if format == "bvh"
+        else {k: f"m_{k.lower()}" for k in BODY.link_names[1:]} | {"Pelvis": "root"},
         metres=unit,
         rest="t_pose",
     )
@@ -209,7 +219,14 @@ def asf_amc(qpos: np.ndarray) -> tuple[str, str]:
         bones.append((name, offset / length, length * scale / 0.0254, np.zeros(3), False))
         bones.append((f"m_{name}", np.array([0.0, 0, 1]), 0.0, own, True))
         tree += [f"{parent} {name}", f"{name} m_{name}"]
-    lines = [":version 1.10", ":name own", ":units", "  mass 1.0", f"  length {scale}", "  angle deg"]
+    lines = [
+        ":version 1.10",
+        ":name own",
+        ":units",
+        "  mass 1.0",
+        f"  length {scale}",
+        "  angle deg",
+    ]
     lines += [":root", "  order TX TY TZ RX RY RZ", "  axis XYZ", "  position 0 0 0"]
     lines += ["  orientation 0 0 0", ":bonedata"]
     for k, (name, direction, length, own, moves) in enumerate(bones):
@@ -257,7 +274,9 @@ def deepmimic(frames: int = 30, seed: int = 3, dt: float = 1 / 30) -> tuple[str,
     t = np.linspace(0, 1, frames)[:, None]
 
     def ball() -> Rotation:
-        return Rotation.from_rotvec(0.6 * np.sin(3 * t + rng.uniform(0, 6, 3)) * rng.uniform(0, 1, 3))
+        return Rotation.from_rotvec(
+            0.6 * np.sin(3 * t + rng.uniform(0, 6, 3)) * rng.uniform(0, 1, 3)
+        )
 
     place = np.concatenate([t, 0.9 + 0.1 * np.sin(3 * t), -0.5 * t], axis=1)
     root, chest, neck = ball(), ball(), ball()

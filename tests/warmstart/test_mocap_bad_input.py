@@ -151,7 +151,7 @@ def test_wrong_units_are_told(unit: float):
 
 def test_an_unknown_skeleton_lists_the_known_ones():
     text = files.bvh(QPOS).replace("L_Knee", "knie_links")
-    with pytest.raises(ValueError, match="unknown skeleton .* bandai_namco.*--joint-map"):
+    with pytest.raises(ValueError, match=r"unknown skeleton .* bandai_namco.*--joint-map"):
         read_bvh(text, OWN)
 
 
@@ -322,11 +322,11 @@ def test_bad_options_are_one_sentence(options: list[str], tmp_path: Path, capsys
 
 def test_a_name_in_an_archive_cannot_lead_out_of_the_folder(tmp_path: Path):
     names = ("../../evil.npz", "/abs.npz", "a/../../b.npz", "x/.hidden.npz")
-    path = archive_of(tmp_path / "in.tar.xz", {name: GOOD["amass.npz"] for name in names})
+    path = archive_of(tmp_path / "in.tar.xz", dict.fromkeys(names, GOOD["amass.npz"]))
     out = tmp_path / "deep" / "clips"
     entries = import_motions(path, out, Options(keep_rejected=True))
     assert len(entries) == 4
-    written = {p for p in tmp_path.rglob("*.npz")}
+    written = set(tmp_path.rglob("*.npz"))
     assert len(written) == 4 and all(p.is_relative_to(out) for p in written)
 
 

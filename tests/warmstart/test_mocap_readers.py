@@ -232,5 +232,3 @@ def test_a_clip_from_a_file_is_one_that_clip_reads(tmp_path: Path):
     clip = retarget(capture_of("smpl")).clip
     clip.save(tmp_path / "a.npz")
     assert np.abs(Clip.load(tmp_path / "a.npz").qpos - clip.qpos).max() < 1e-5
-
-

@@ -117,9 +117,7 @@ def parse(text: str) -> Hierarchy:
     if len(set(names)) != len(names) or parent.count(-1) != 1:
         raise ValueError("its hierarchy has several roots, or two joints of one name")
     fps, motion = _motion(tail, sum(map(len, channels)))
-    return Hierarchy(
-        tuple(names), tuple(parent), np.array(offset), tuple(channels), fps, motion
-    )
+    return Hierarchy(tuple(names), tuple(parent), np.array(offset), tuple(channels), fps, motion)
 
 
 def forward(tree: Hierarchy) -> tuple[np.ndarray, np.ndarray]:

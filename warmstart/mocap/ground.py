@@ -9,6 +9,7 @@ take up what is left, so that soles in contact are level with the floor and do n
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import (
@@ -58,7 +59,7 @@ class Contacts:
     @property
     def foot(self) -> np.ndarray:
         """(T, 2) whether any part of a foot is."""
-        return self.down.any(-1)
+        return np.any(self.down, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,7 +298,7 @@ def _bridge(shift: np.ndarray, spans: list[tuple[int, int]], reach: int) -> np.n
     out = shift.copy()
     reach = max(reach, 1)
     ends = [(0, spans[0][0])] if spans else []
-    ends += [(a[1], b[0]) for a, b in zip(spans, spans[1:])]
+    ends += [(a[1], b[0]) for a, b in pairwise(spans)]
     ends += [(spans[-1][1], frames)] if spans else []
     for first, last in ends:
         size = last - first

@@ -99,9 +99,7 @@ class _Guesser:
         rest_spine, rest_across = rest["Neck"] - rest_middle, rest["L_Hip"] - rest["R_Hip"]
         plain = _frame(across, spine) @ _frame(rest_across, rest_spine).T
         pelvis = self._follow("Pelvis", plain, np.ones(self.frames))
-        broad, rest_broad = (
-            x["L_Shoulder"] - x["R_Shoulder"] for x in (p, rest)
-        )
+        broad, rest_broad = (x["L_Shoulder"] - x["R_Shoulder"] for x in (p, rest))
         plain = _frame(broad, spine) @ _frame(rest_broad, rest_spine).T
         chest = self._follow("Chest", plain, np.ones(self.frames))
         between = log(np.swapaxes(pelvis, 1, 2) @ chest)
@@ -116,11 +114,12 @@ class _Guesser:
         half = 0.5 * np.linalg.norm(rest_across)
         for side, sign in zip(SIDES, (1.0, -1.0)):
             self.targets[side + "Hip"] = hips + sign * half * unit(across)
-        reach = np.linalg.norm(rest_spine) / np.percentile(np.linalg.norm(spine, axis=1), 90)
+        long, wide = (np.linalg.norm(x, axis=1) for x in (spine, broad))
+        reach = np.linalg.norm(rest_spine) / max(float(np.percentile(long, 90)), 0.05)
         neck = self.targets["Neck"] = hips + reach * spine
         upper = _frame(broad, spine)
         rest_upper = _frame(rest_broad, rest_spine)
-        widen = np.linalg.norm(rest_broad) / np.median(np.linalg.norm(broad, axis=1))
+        widen = np.linalg.norm(rest_broad) / max(float(np.median(wide)), 0.05)
         for side in SIDES:
             name = side + "Shoulder"
             place = np.swapaxes(upper, 1, 2) @ (p[name] - p["Neck"])[..., None]
@@ -246,7 +245,7 @@ class _Guesser:
         plain: np.ndarray,
         sure: np.ndarray,
     ) -> np.ndarray:
-        """Without rotations of the source: twist from the limb's plane, held while it is straight."""
+        """Without rotations of the source: twist from the limb's plane, held while straight."""
         swung = self._aligned(parent, rest_bone, bone)
         twist = (log(np.swapaxes(swung, 1, 2) @ plain) * rest_bone).sum(-1)
         known = np.flatnonzero(sure > 0.5)

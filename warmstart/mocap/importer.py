@@ -84,7 +84,10 @@ def import_motions(
     found = recordings(source) if isinstance(source, str | Path) else source
     for recording in found:
         digest = hashlib.sha256(key.encode())
-        for part in (recording.data, *(recording.skeletons[k] for k in sorted(recording.skeletons))):
+        for part in (
+            recording.data,
+            *(recording.skeletons[k] for k in sorted(recording.skeletons)),
+        ):
             digest.update(part)
         name = _clip_name(recording, taken)
         old = before.get(recording.label)

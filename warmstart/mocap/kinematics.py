@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from sports.humanoid.body import Body, support_points
+from warmstart import rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +106,6 @@ def exp(phi: np.ndarray) -> np.ndarray:
 
 def log(turn: np.ndarray) -> np.ndarray:
     """(..., 3) rotation vector (rad), of length at most pi, of a rotation matrix."""
-    from warmstart import rotation
-
     return rotation.log(quaternion(turn))
 
 

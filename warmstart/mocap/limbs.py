@@ -49,7 +49,7 @@ def bend_for(
     along = (upper @ axis) * (lower @ axis)
     a = (upper * lower).sum(-1) - along
     b = np.cross(lower, upper) @ axis
-    size, middle = np.hypot(a, b), np.arctan2(b, a)
+    size, middle = np.maximum(np.hypot(a, b), 1e-12), np.arctan2(b, a)
     squares = (upper**2).sum(-1) + (lower**2).sum(-1)
     cosine = ((far**2 - squares) / 2 - along) / size
     longest = np.sqrt(squares + 2 * (along + size))
@@ -94,9 +94,7 @@ def move_end(
     # Which way it is bent now: a knee of a recording may be overstretched.
     side = np.where(np.cross(lower, upper) @ axis > 0, -1.0, 1.0)
     now, longest = bend_for(upper, lower, axis, far, side)
-    want = np.clip(
-        np.linalg.norm(goal, axis=1), 0.3 * longest, np.maximum(REACH * longest, far)
-    )
+    want = np.clip(np.linalg.norm(goal, axis=1), 0.3 * longest, np.maximum(REACH * longest, far))
     # Both answers hold the same rounding, so that nothing asked is nothing done.
     then, _ = bend_for(upper, lower, axis, np.where(shift.any(1), want, far), side)
     bend = exp((then - now)[:, None] * axis)

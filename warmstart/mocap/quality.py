@@ -122,9 +122,7 @@ def measure(
     lift = moved[:, None] * np.array([0.0, 0.0, 1.0])
     error = np.stack([np.linalg.norm(ours[n] - targets[n] - lift, axis=1) for n in targets], 1)
     far = [np.linalg.norm(ours[n] - scaled[n] - lift, axis=1) for n in scaled if n in ours]
-    cosine = [
-        (unit(ours[b] - ours[a]) * unit(scaled[b] - scaled[a])).sum(1) for a, b in BONES
-    ]
+    cosine = [(unit(ours[b] - ours[a]) * unit(scaled[b] - scaled[a])).sum(1) for a, b in BONES]
     surface = chain.heights(frames)
     soles = Soles(chain)
     height = np.where(contacts.down, soles.heights(surface), np.inf).min(2)[contacts.foot]

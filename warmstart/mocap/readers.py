@@ -86,7 +86,7 @@ def _fps(recording: Recording) -> float | None:
 
 
 def _skeleton_of(recording: Recording) -> str:
-    """The ASF file of an AMC file: of its subject (``02.asf`` of ``02_01.amc``), or the only one."""
+    """The ASF file of an AMC file: of its subject (``02.asf`` of ``02_01.amc``), or the one."""
     stem = PurePosixPath(recording.name).stem
     by_stem = {PurePosixPath(path).stem: path for path in recording.skeletons}
     for candidate in (stem, stem.rpartition("_")[0]):

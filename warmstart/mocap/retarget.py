@@ -15,13 +15,13 @@ from warmstart.mocap.capture import KEY_JOINTS, Capture, without_t_pose
 from warmstart.mocap.fit import Aim, fit
 from warmstart.mocap.ground import find_contacts, ground
 from warmstart.mocap.guess import first_guess
-from warmstart.mocap.kinematics import Chain, log, quaternion
+from warmstart.mocap.kinematics import Chain, matrix, quaternion
 from warmstart.mocap.quality import Quality, measure
 
 HOLD = 0.05
 """Weight of a link's first guess in the fit (m of joint error per rad)."""
 STIFF = 100.0
-HINGED = {
+HINGED: dict[str, float | tuple[float, float, float]] = {
     **{f"{side}_Knee": (STIFF, HOLD, STIFF) for side in "LR"},
     **{f"{side}_Elbow": (STIFF, STIFF, HOLD) for side in "LR"},
 }
@@ -64,7 +64,7 @@ def retarget(
     fps = capture.fps
     guess = first_guess(chain, capture)
     weights = {name: 0.5 if name in HINGED else 1.0 for name in KEY_JOINTS}
-    hold = {name: HINGED.get(name, (HOLD,) * 3) for name in chain.names if name in _MOVING}
+    hold = {name: HINGED.get(name, HOLD) for name in chain.names if name in _MOVING}
     root, local = fit(chain, guess.root, chain.local(guess.turn), Aim(guess.targets, weights, hold))
     if cutoff is None and capture.meta.get("layout") in NOISY:
         cutoff = CUTOFF
@@ -110,8 +110,6 @@ def smooth(
     if not (math.isfinite(cutoff) and cutoff > 0):
         raise ValueError(f"a cutoff of {cutoff} Hz")
     width = fps * math.sqrt(math.log(2)) / (2 * math.pi * cutoff)
-    from warmstart.mocap.kinematics import matrix
-
     quat = quaternion(local)
     quat[1:] *= _side(quat)
     mean = gaussian_filter1d(quat, width, axis=0, mode="nearest")
@@ -129,7 +127,7 @@ def hinge_angles(body: Body, local: np.ndarray) -> np.ndarray:
     """(T, n) hinge angles (rad) of rotations (T, B, 3, 3) against the parent, intrinsic X-Y-Z.
 
     A rotation has two triples, (x, y, z) and (x + pi, pi - y, z + pi), and whole turns of each. The
-    first frame takes the smallest, every further one the nearest to the frame before, so that hinges
+    first frame takes the smallest, every further one the nearest to the frame before: hinges then
     run on through the singular pose; whole turns beyond the joint's range are taken back.
     """
     r = local[:, 1:]
@@ -165,7 +163,5 @@ def hinge_angles(body: Body, local: np.ndarray) -> np.ndarray:
 
 def local_rotations(body: Body, qpos: np.ndarray) -> np.ndarray:
     """(T, B, 3, 3) parent <- link (the root: world <- root) of a clip's ``qpos``."""
-    from warmstart.mocap.kinematics import matrix
-
     joints = rotation.from_hinges(qpos[:, 7:].reshape(len(qpos), -1, 3))
     return matrix(np.concatenate([qpos[:, None, 3:7], joints], axis=1))

@@ -4,7 +4,8 @@ A map is a JSON object:
 
 * ``name``, ``format`` (``bvh``, ``asf``, ``deepmimic``, ``skillmimic``) and ``source``;
 * ``metres``: length of the file's unit;
-* ``axes``: the file's directions forward, left and up, as ``["z", "x", "y"]`` or ``["x", "-z", "y"]``;
+* ``axes``: the file's directions forward, left and up, as ``["z", "x", "y"]`` or
+  ``["x", "-z", "y"]``;
 * ``rest``: ``t_pose`` when all rotations are zero in our zero pose, ``unknown`` when they are not;
 * ``joints``: our joint -> the file's joint. ``"lFoot end"`` is the end site of ``lFoot``;
 * ``turns``: our link -> the file's joint whose rotation carries it. Left out: as ``joints``;

@@ -163,4 +163,6 @@ def _join(parts: list[np.ndarray]) -> np.ndarray:
 
 def _check(value: np.ndarray, what: str) -> None:
     if not np.isfinite(value).all():
-        raise ValueError(f"{what} is not a number at frame {np.argwhere(~np.isfinite(value))[0, 0]}")
+        raise ValueError(
+            f"{what} is not a number at frame {np.argwhere(~np.isfinite(value))[0, 0]}"
+        )

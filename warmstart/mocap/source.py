@@ -101,7 +101,9 @@ def _of_archive(path: Path, facts: Mapping[str, Mapping[str, str]]) -> Iterator[
         members = dict(_members(path))
     except _DAMAGE as error:
         text = str(error).strip().splitlines()
-        raise ValueError(f"{path} is a damaged archive: {text[0] if text else 'cut off'}") from error
+        raise ValueError(
+            f"{path} is a damaged archive: {text[0] if text else 'cut off'}"
+        ) from error
     skeletons = {name: data for name, data in members.items() if name.lower().endswith(".asf")}
     for name in sorted(members):
         if name.lower().endswith(SUFFIXES) and _is_motion(name, members[name]):
@@ -146,7 +148,9 @@ def _members(path: Path) -> Iterator[tuple[str, bytes]]:
 
 def _room(path: Path, total: int, size: int) -> int:
     if size > MAX_BYTES or total + size > 8 * MAX_BYTES:
-        raise ValueError(f"{path} unpacks to more than is sensible ({(total + size) / 2**20:.0f} MiB)")
+        raise ValueError(
+            f"{path} unpacks to more than is sensible ({(total + size) / 2**20:.0f} MiB)"
+        )
     return total + size
 
 
