@@ -29,8 +29,9 @@ LEG = (0.4, 1.3)
 FPS = (5.0, 1000.0)
 """Lowest and highest frame rate of a recording."""
 MAX_FRAMES = 400_000
-STRAIGHT = 0.966
-"""Cosine of the angle within which a limb counts as stretched in a T-pose: 15 degrees."""
+T_POSE = {"arm": 0.93, "leg": 0.966}
+"""Cosine of the angle within which a limb counts as stretched in a T-pose: 21 and 15 degrees (the
+forearms of some skeletons point forward a little in theirs)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +107,8 @@ def unit(vector: np.ndarray) -> np.ndarray:
 def without_t_pose(capture: Capture) -> Capture:
     """The recording from the first frame on that is not the T-pose of a calibration.
 
-    A T-pose: both arms stretched sideways and both legs stretched, within 15 degrees. Raises
-    ValueError when fewer than 2 frames are left.
+    A T-pose: both arms stretched sideways and both legs downward. Raises ValueError when fewer than
+    2 frames are left.
     """
     p = capture.points
     across = unit(p["L_Shoulder"] - p["R_Shoulder"])
@@ -116,9 +117,9 @@ def without_t_pose(capture: Capture) -> Capture:
     for side, sign in zip(SIDES, (1.0, -1.0)):
         for a, b in (("Shoulder", "Elbow"), ("Elbow", "Wrist")):
             bone = unit(p[side + b] - p[side + a])
-            still &= sign * (bone * across).sum(1) > STRAIGHT
+            still &= sign * (bone * across).sum(1) > T_POSE["arm"]
         for a, b in (("Hip", "Knee"), ("Knee", "Ankle")):
-            still &= (unit(p[side + b] - p[side + a]) * down).sum(1) > STRAIGHT
+            still &= (unit(p[side + b] - p[side + a]) * down).sum(1) > T_POSE["leg"]
     first = capture.num_frames if still.all() else int(np.argmin(still))
     if first == 0:
         return capture
