@@ -16,6 +16,8 @@ from olympics_opt import cli
 from tests.warmstart import mocap_files as files
 from warmstart.clip import Clip
 from warmstart.mocap.importer import Options, import_motions, summaries
+from warmstart.mocap.readers import read_capture
+from warmstart.mocap.retarget import retarget
 from warmstart.mocap.source import recordings
 
 ARCHIVES = os.environ.get("OLYMPICS_OPT_MOCAP", "")
@@ -178,7 +180,32 @@ def test_an_unknown_command_of_mocap(capsys):
     assert "mocap has no command 'export'" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(not ARCHIVES, reason="OLYMPICS_OPT_MOCAP names no folder of archives")
+real = pytest.mark.skipif(not ARCHIVES, reason="OLYMPICS_OPT_MOCAP names no folder of archives")
+
+
+@real
+def test_one_kick_in_two_formats_is_one_motion():
+    """A kick of the CMU database, as ASF/AMC and as BVH on another skeleton, a frame apart."""
+    qpos = []
+    for archive, name in (("cmu", "11_01.amc"), ("cmu_bvh", "11_01.bvh")):
+        path = Path(ARCHIVES) / f"{archive}.tar.xz"
+        recording = next(r for r in recordings(path) if r.name == name)
+        qpos.append(retarget(read_capture(recording)).clip.qpos)
+    a, b = qpos[0][1:], qpos[1]
+    mine, theirs = files.positions(a), files.positions(b)
+    apart = np.stack([mine[k] - theirs[k] for k in mine], axis=1)
+    apart -= apart.mean((0, 1))  # the origin of the room
+    assert np.linalg.norm(apart, axis=-1).mean() < 0.035
+    one, two = files.rotations(a), files.rotations(b)
+    turns = [r["Pelvis"] * r["Torso"] * r["Spine"] * r["Chest"] for r in (one, two)]
+    assert np.degrees((one["Pelvis"].inv() * two["Pelvis"]).magnitude()).mean() < 5
+    assert np.degrees((turns[0].inv() * turns[1]).magnitude()).mean() < 5
+    for side in "LR":
+        legs = [r["Pelvis"] * r[f"{side}_Hip"] * r[f"{side}_Knee"] for r in (one, two)]
+        assert np.degrees((legs[0].inv() * legs[1]).magnitude()).mean() < 7
+
+
+@real
 def test_the_real_archives_hold_the_bounds(tmp_path: Path):
     """Every tenth file of each archive."""
     for path in sorted(Path(ARCHIVES).glob("*.tar.xz")):

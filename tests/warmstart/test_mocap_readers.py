@@ -210,6 +210,8 @@ def test_a_joint_map_of_a_users_own(tmp_path: Path):
         ({"rest": "a_pose"}, "rest is 'a_pose'"),
         ({"axes": ["x", "y", "y"]}, "axes"),
         ({"axes": ["y", "x", "z"]}, "axes"),  # left-handed
+        ({"offsets": {"a": [1, 2]}}, "offsets must give three numbers"),
+        ({"rest_turns": {"a": ["x", 0, 0]}}, "rest_turns must give three numbers"),
         ({"colour": "red"}, "unknown entry 'colour'"),
     ],
 )

@@ -241,6 +241,18 @@ def test_feet_that_slide_are_held():
         assert drift[0] > 0.05 and drift[1] < 0.01
 
 
+@pytest.mark.parametrize("roll", [-0.4, 0.4])
+def test_feet_that_lean_are_laid_flat(roll: float):
+    qpos = standing(31, 30.0, 0.0)
+    for side in "LR":
+        qpos[:, 7 + BODY.dof_index(f"{side}_Ankle_x")] = roll
+    done = ground(CHAIN, *posed(qpos), 30.0)
+    turn = CHAIN.frames(done.root, done.local).turn
+    for side in "LR":
+        across = turn[:, CHAIN.index[f"{side}_Ankle"], 2, 1]
+        assert np.abs(across).max() < 1e-6
+
+
 def test_a_jump_on_the_spot_is_no_contact_at_its_height():
     fps = 30.0
     qpos = standing(31, fps, 0.0)

@@ -39,6 +39,9 @@ def read_bvh(
     """The motion of a BVH file. Raises ValueError for anything that is not one."""
     tree = parse(text)
     joint_map = find_map("bvh", set(tree.names), maps)
+    for joint, offset in joint_map.offsets.items():
+        if joint in tree.names:
+            tree.offset[tree.names.index(joint)] = offset
     return place(*forward(tree), list(tree.names), joint_map, fps or tree.fps)
 
 

@@ -11,12 +11,14 @@ A map is a JSON object:
 * ``turns``: our link -> the file's joint whose rotation carries it. Left out: as ``joints``;
 * ``rest_turns``: link -> (x, y, z) degrees, the rotation of our link from the T-pose to the file's
   zero pose, about our axes, where the two differ;
+* ``offsets`` (BVH): the file's joint -> the offset (file units and axes) that it has instead;
 * ``bones`` (DeepMimic): joint -> parent and offset, in the file's axes.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
@@ -42,6 +44,7 @@ class JointMap:
     rest: str = "unknown"
     turns: dict[str, str] | None = None
     rest_turns: dict[str, list[float]] = field(default_factory=dict)
+    offsets: dict[str, list[float]] = field(default_factory=dict)
     bones: dict[str, Any] = field(default_factory=dict)
     source: str = ""
 
@@ -59,6 +62,9 @@ class JointMap:
             raise ValueError("metres must be a number")
         if not 1e-4 <= self.metres <= 10:
             raise ValueError(f"a unit of {self.metres} m")
+        for what, table in (("rest_turns", self.rest_turns), ("offsets", self.offsets)):
+            if not isinstance(table, dict) or not all(map(_is_triple, table.values())):
+                raise ValueError(f"{what} must give three numbers for each name")
         if self.rest not in ("t_pose", "unknown"):
             raise ValueError(f"rest is '{self.rest}', not t_pose or unknown")
         if self.matrix is None:
@@ -87,6 +93,14 @@ class JointMap:
         """Names of the file's joints that this map needs."""
         names = {*self.joints.values(), *self.carriers.values()}
         return {name.removesuffix(" end") for name in names}
+
+
+def _is_triple(value: Any) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) == 3
+        and all(isinstance(x, int | float) and math.isfinite(x) for x in value)
+    )
 
 
 def read_joint_map(path: str | Path) -> JointMap:
