@@ -19,6 +19,7 @@ from warmstart.mocap.importer import Options, import_motions, summaries
 from warmstart.mocap.readers import read_capture
 from warmstart.mocap.retarget import retarget
 from warmstart.mocap.source import recordings
+from warmstart.outcome import lowest
 
 ARCHIVES = os.environ.get("OLYMPICS_OPT_MOCAP", "")
 """Folder with archives of real recordings; without it they are not tested."""
@@ -216,3 +217,9 @@ def test_the_real_archives_hold_the_bounds(tmp_path: Path):
         assert found["joint_error_cm"] <= 3.5
         assert found["contact_height_cm"] <= 1.0
         assert found["sunk_frames_percent"] <= 0.5
+        low = [  # by MuJoCo's shapes
+            lowest(files.BODY, Clip.load(tmp_path / "clips" / e.clip).qpos)
+            for e in entries
+            if e.clip is not None
+        ]
+        assert (np.concatenate(low) < -0.02).mean() <= 0.005
