@@ -53,35 +53,82 @@ def test_the_good_file_is_read(name: str):
     assert read_capture(record(name, GOOD[name]), 30.0, OWN).num_frames == 6
 
 
-@pytest.mark.parametrize("name", GOOD)
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(data=st.data())
-def test_a_damaged_file_is_a_motion_or_a_sentence(name: str, data):
-    """Cut off, bytes changed, parts doubled or left out, numbers replaced."""
-    raw = GOOD[name]
+def damaged(raw: bytes, data: st.DataObject) -> bytes:
+    """Cut off, bytes changed, parts doubled or left out, words replaced."""
     at = data.draw(st.integers(0, len(raw)))
     kind = data.draw(st.sampled_from(["cut", "bytes", "drop", "double", "words"]))
     if kind == "cut":
-        raw = raw[:at]
-    elif kind == "bytes":
+        return raw[:at]
+    if kind == "bytes":
         new = data.draw(st.binary(min_size=1, max_size=8))
-        raw = raw[:at] + new + raw[at + len(new) :]
-    elif kind == "drop":
-        raw = raw[:at] + raw[at + data.draw(st.integers(1, 200)) :]
-    elif kind == "double":
-        size = data.draw(st.integers(1, 200))
-        raw = raw[: at + size] + raw[at:]
-    else:
-        word = data.draw(st.sampled_from([b"nan", b"1e999", b"-1", b"{", b"}", b"End Site", b":"]))
-        words = raw.split(b" ")
-        words[data.draw(st.integers(0, len(words) - 1))] = word
-        raw = b" ".join(words)
+        return raw[:at] + new + raw[at + len(new) :]
+    size = data.draw(st.integers(1, 200))
+    if kind == "drop":
+        return raw[:at] + raw[at + size :]
+    if kind == "double":
+        return raw[: at + size] + raw[at:]
+    word = data.draw(st.sampled_from([b"nan", b"1e999", b"-1", b"{", b"}", b"End Site", b":"]))
+    words = raw.split(b" ")
+    words[data.draw(st.integers(0, len(words) - 1))] = word
+    return b" ".join(words)
+
+
+@pytest.mark.parametrize("name", GOOD)
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data())
+def test_a_damaged_file_is_a_motion_or_a_sentence(name: str, data: st.DataObject):
+    raw = damaged(GOOD[name], data)
     try:
         capture = read_capture(record(name, raw), 30.0, OWN)
     except ValueError as error:
         assert "\n" not in str(error) and str(error).startswith(name)
     else:
         assert all(np.isfinite(p).all() for p in capture.points.values())
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data())
+def test_a_damaged_skeleton_is_a_motion_or_a_sentence(data: st.DataObject):
+    asf = damaged(ASF.encode(), data)
+    try:
+        read_capture(Recording("", "a.amc", AMC.encode(), {"a.asf": asf}), 30.0, OWN)
+    except ValueError as error:
+        assert "\n" not in str(error)
+
+
+def boxes() -> dict[str, bytes]:
+    """The same file in archives of three kinds."""
+    out = {}
+    for mode in ("xz", "gz"):
+        buffer = io.BytesIO()
+        with tarfile.open(fileobj=buffer, mode=f"w:{mode}") as archive:
+            info = tarfile.TarInfo("a.bvh")
+            info.size = len(GOOD["a.bvh"])
+            archive.addfile(info, io.BytesIO(GOOD["a.bvh"]))
+        out[f"tar.{mode}"] = buffer.getvalue()
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.bvh", GOOD["a.bvh"])
+    return {**out, "zip": buffer.getvalue()}
+
+
+BOXES = boxes()
+
+
+@pytest.mark.parametrize("kind", BOXES)
+@settings(
+    max_examples=40,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(data=st.data())
+def test_a_damaged_archive_is_recordings_or_a_sentence(kind: str, data, tmp_path: Path):
+    path = tmp_path / f"box.{kind}"
+    path.write_bytes(damaged(BOXES[kind], data))
+    try:
+        assert [r.label for r in recordings(path)]
+    except ValueError as error:
+        assert "\n" not in str(error) and str(path) in str(error)
 
 
 @pytest.mark.parametrize("name", GOOD)

@@ -15,13 +15,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from warmstart.mocap.capture import KEY_JOINTS, SIDES, Capture, unit
-from warmstart.mocap.kinematics import Chain, exp, log, nearest_rotation, swing
+from warmstart.mocap.kinematics import (
+    Chain,
+    exp,
+    log,
+    nearest_rotation,
+    quaternion,
+    swing,
+)
 from warmstart.mocap.limbs import bend_for, hinge_of, limb_of
 
 BENT = 0.25
 """A limb shows its plane from this sine of its bend on; below, its twist is carried over."""
 OWN = 1e-4
 """A skeleton is ours when its joints lie this near (m) where our bones would put them."""
+WRIST = 2.1
+"""A hand that is turned against its forearm by more than this (rad) is a glitch."""
 LEVEL = 0.12
 """A foot is taken to lie flat when it is this slow (m/s, scaled) and near its lowest."""
 
@@ -134,14 +143,31 @@ class _Guesser:
             self._limb(limb_of(side, "leg"), "Pelvis")
             self._limb(limb_of(side, "arm"), "Chest")
             self._foot(side)
-            hand = side + "Wrist"
-            self.turn[hand] = self._bend(hand, self.turn[side + "Elbow"])
+            self._hand(side)
+
+    def _hand(self, side: str) -> None:
+        """The hand; the forearm takes half of its twist, as bones do.
+
+        With all of it the wrist would turn 90 degrees about its middle hinge, where hinges lock.
+        """
+        elbow, wrist = side + "Elbow", side + "Wrist"
+        forearm = self.turn[elbow]
+        local = log(np.swapaxes(forearm, 1, 2) @ self._bend(wrist, forearm))
+        good = np.linalg.norm(local, axis=1) < WRIST
+        if good.any() and not good.all():  # glitches of a recording
+            at = np.arange(self.frames)
+            local = np.stack([np.interp(at, at[good], x[good]) for x in local.T], axis=1)
+        self.turn[wrist] = hand = forearm @ exp(local)
+        axis = self._rest_bone(elbow, wrist)
+        quat = quaternion(np.swapaxes(forearm, 1, 2) @ hand)
+        twist = np.unwrap(2 * np.arctan2(quat[:, 1:] @ axis, quat[:, 0]))
+        twist -= 2 * np.pi * np.round(np.median(twist) / (2 * np.pi))
+        self.turn[elbow] = forearm @ exp(0.5 * twist[:, None] * axis)
 
     def _limb(self, limb: tuple[str, str, str], parent: str) -> None:
         """Both links of a leg or an arm, and the targets of its joints.
 
-        The second link turns about its hinge alone: twist that a source has there is its hand's or
-        foot's. The end of the limb is met, the middle up to a centimetre or two: our bones do not
+        The second link turns about its hinge alone here. The end of the limb is met, the middle up to a centimetre or two: our bones do not
         lie in the plane that the hinge turns in.
         """
         a, b, c = limb

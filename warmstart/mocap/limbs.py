@@ -13,6 +13,8 @@ from warmstart.mocap.kinematics import Chain, Frames, exp, swing
 
 REACH = 0.998
 """A limb is stretched to this share of its longest at most, or as far as it was."""
+OVERSTRETCHED = 0.1
+"""Sine of the angle by which a limb is bent the wrong way before it is taken to be."""
 HINGES = {
     "Knee": np.array([0.0, 1.0, 0.0]),
     "L_Elbow": np.array([0.0, 0.0, -1.0]),
@@ -91,8 +93,10 @@ def move_end(
     far = np.linalg.norm(tip - start, axis=1)
     goal = tip + shift - start
     axis = hinge_of(limb[1])
-    # Which way it is bent now: a knee of a recording may be overstretched.
-    side = np.where(np.cross(lower, upper) @ axis > 0, -1.0, 1.0)
+    # Which way it is bent now: a knee of a recording may be overstretched. One that is stretched
+    # to within a few degrees bends as knees do.
+    past = np.cross(unit(lower), unit(upper)) @ axis
+    side = np.where(past > OVERSTRETCHED, -1.0, 1.0)
     now, longest = bend_for(upper, lower, axis, far, side)
     want = np.clip(np.linalg.norm(goal, axis=1), 0.3 * longest, np.maximum(REACH * longest, far))
     # Both answers hold the same rounding, so that nothing asked is nothing done.

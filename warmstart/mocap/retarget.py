@@ -23,10 +23,10 @@ HOLD = 0.05
 STIFF = 100.0
 HINGED: dict[str, float | tuple[float, float, float]] = {
     **{f"{side}_Knee": (STIFF, HOLD, STIFF) for side in "LR"},
-    **{f"{side}_Elbow": (STIFF, STIFF, HOLD) for side in "LR"},
+    **{f"{side}_Elbow": HOLD for side in "LR"},
 }
-"""Knees and elbows keep to their hinge: near 90 degrees of flexion of a knee, whose hinge is the
-middle one, anything else would spin the other two."""
+"""Knees keep to their hinge: it is the middle one, and near 90 degrees of flexion anything else
+would spin the other two."""
 SINGULAR = 1e-5
 """Cosine of a joint's middle hinge below which its other two are not told apart."""
 NOISY = ("TRAM", "WHAM", "GVHMR")
