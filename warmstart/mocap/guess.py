@@ -145,30 +145,11 @@ class _Guesser:
             self._foot(side)
             self._hand(side)
 
-    def _hand(self, side: str) -> None:
-        """The hand; the forearm takes half of its twist, as bones do.
-
-        With all of it the wrist would turn 90 degrees about its middle hinge, where hinges lock.
-        """
-        elbow, wrist = side + "Elbow", side + "Wrist"
-        forearm = self.turn[elbow]
-        local = log(np.swapaxes(forearm, 1, 2) @ self._bend(wrist, forearm))
-        good = np.linalg.norm(local, axis=1) < WRIST
-        if good.any() and not good.all():  # glitches of a recording
-            at = np.arange(self.frames)
-            local = np.stack([np.interp(at, at[good], x[good]) for x in local.T], axis=1)
-        self.turn[wrist] = hand = forearm @ exp(local)
-        axis = self._rest_bone(elbow, wrist)
-        quat = quaternion(np.swapaxes(forearm, 1, 2) @ hand)
-        twist = np.unwrap(2 * np.arctan2(quat[:, 1:] @ axis, quat[:, 0]))
-        twist -= 2 * np.pi * np.round(np.median(twist) / (2 * np.pi))
-        self.turn[elbow] = forearm @ exp(0.5 * twist[:, None] * axis)
-
     def _limb(self, limb: tuple[str, str, str], parent: str) -> None:
         """Both links of a leg or an arm, and the targets of its joints.
 
-        The second link turns about its hinge alone here. The end of the limb is met, the middle up to a centimetre or two: our bones do not
-        lie in the plane that the hinge turns in.
+        The second link turns about its hinge alone here. The end of the limb is met, the middle up
+        to a centimetre or two: our bones do not lie in the plane that the hinge turns in.
         """
         a, b, c = limb
         upper, lower = self._bone(a, b), self._bone(b, c)
@@ -195,6 +176,25 @@ class _Guesser:
             turn = self._twist(self.turn[parent], span, reach, plain, sure)
         self.turn[a] = self._aligned(turn, span, reach)
         self.turn[b] = self.turn[a] @ bent
+
+    def _hand(self, side: str) -> None:
+        """The hand; the forearm takes half of its twist, as bones do.
+
+        With all of it the wrist would turn 90 degrees about its middle hinge, where hinges lock.
+        """
+        elbow, wrist = side + "Elbow", side + "Wrist"
+        forearm = self.turn[elbow]
+        local = log(np.swapaxes(forearm, 1, 2) @ self._bend(wrist, forearm))
+        good = np.linalg.norm(local, axis=1) < WRIST
+        if good.any() and not good.all():  # glitches of a recording
+            at = np.arange(self.frames)
+            local = np.stack([np.interp(at, at[good], x[good]) for x in local.T], axis=1)
+        self.turn[wrist] = hand = forearm @ exp(local)
+        axis = self._rest_bone(elbow, wrist)
+        quat = quaternion(np.swapaxes(forearm, 1, 2) @ hand)
+        twist = np.unwrap(2 * np.arctan2(quat[:, 1:] @ axis, quat[:, 0]))
+        twist -= 2 * np.pi * np.round(np.median(twist) / (2 * np.pi))
+        self.turn[elbow] = forearm @ exp(0.5 * twist[:, None] * axis)
 
     def _foot(self, side: str) -> None:
         """The foot's link and toe; its pitch is set so that a foot that rests is flat."""
