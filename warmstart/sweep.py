@@ -1,9 +1,13 @@
-"""Many optimisations at once: one process per solve, results on disk, started again where it was.
+"""One option over a range: many optimisations at once, on disk, taken up again where they stopped.
 
-A sweep's directory holds, per value, ``NAME.npz`` (the solution), ``NAME.json`` (what happened)
-and, when certified, ``NAME.certificate.json``; and ``sweep.json``, the table. Each file is written
-atomically, so a sweep that was killed goes on with what is missing. Processes are spawned, never
-forked, and never shared between solves: Python constraints of the solvers are not thread-safe.
+A sweep's folder holds the files of each value (see :mod:`warmstart.job`), ``sweep.json``, the
+table so far, and ``sweep.png``, its plot. Each file is written atomically, the result of a value
+last, so a sweep that was killed goes on with what is missing and ends with the same table.
+
+What a value starts from does not depend on which process was faster. Without ``continuation``
+every value starts from the problem's own guess; a value that then has no certified motion is tried
+once more from the nearest neighbour that has one, and both attempts are kept. With
+``continuation`` the values are taken one after another, each from the nearest one solved before.
 """
 
 from __future__ import annotations
@@ -12,45 +16,22 @@ import dataclasses
 import importlib
 import json
 import math
-import multiprocessing
-import os
-import time
-import traceback
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
-from multiprocessing.connection import wait
-from multiprocessing.process import BaseProcess
+from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from warmstart.atomic import write_json
+from warmstart.job import GOOD, Job, Result, left_over
+from warmstart.sweep_report import plot, table
+from warmstart.workers import Run, workers
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-@dataclass(frozen=True)
-class Result:
-    """What became of one value of a sweep."""
-
-    name: str
-    value: float
-    status: str
-    """``certified``, ``solved`` (no certificate asked), ``rejected`` (the gate), ``infeasible``
-    (no solution, with the reason) or ``crashed``."""
-    reason: str
-    """Why it is not a demonstration; empty where it is."""
-    seconds: float
-    achieved: dict[str, float]
-    objective: float | None = None
-
-    @property
-    def finished(self) -> bool:
-        """Whether it stays as it is when the sweep is run again; a crash is tried again."""
-        return self.status != "crashed"
+TABLE, PLOT = "sweep.json", "sweep.png"
+_AGAIN = ("infeasible", "rejected")
+"""States that another start may mend."""
 
 
 def sweep(
@@ -60,214 +41,218 @@ def sweep(
     out_dir: str | Path,
     *,
     processes: int = 2,
+    cluster: str | None = None,
     options: dict[str, Any] | None = None,
     certify: bool = True,
+    track: bool = False,
     continuation: bool = False,
     show: bool = True,
     registry: str = "warmstart.problems",
 ) -> list[Result]:
     """Solves a problem for every value of one config field; returns the results in their order.
 
-    ``options`` are further config fields. With ``continuation`` each solve starts from its
-    neighbour's solution, the nearest one already on disk, so values are taken one after another
-    from each process. ``registry`` is a module with ``get_problem(name)`` returning an object
-    with ``config`` (a dataclass) and ``solve(config, guess=None) -> Solution``. Files of finished
-    values are kept; those of another problem, option or field are refused. Raises ValueError for
-    an unknown problem or field, for a value that is not finite or occurs twice, and when the
-    directory holds another sweep.
+    ``options`` are further config fields. ``track`` follows each certified motion in MuJoCo with
+    feedback. ``cluster`` is an address for Ray (see :func:`warmstart.workers.ray_cluster`).
+    ``registry`` is a module with ``get_problem(name)`` returning an object with ``config`` (a
+    dataclass), ``outcome`` and ``unit``, and ``solve(config, guess=None) -> Solution``. Files of
+    finished values are kept; a folder of another sweep is refused. Raises ValueError, and then
+    nothing is written, for an unknown problem or field, a field that is no number, a value that
+    the problem does not accept, that is not finite or occurs twice.
     """
-    values, options = [float(v) for v in values], dict(options or {})
-    if not values or not all(math.isfinite(v) for v in values) or len(set(values)) < len(values):
-        raise ValueError(f"a sweep needs different finite values, not {values}")
-    if processes < 1:
-        raise ValueError(f"a sweep needs at least one process, not {processes}")
-    config = importlib.import_module(registry).get_problem(problem).config
-    known = [f.name for f in dataclasses.fields(config)]
-    for name in (field, *options):
-        if name not in known:
-            raise ValueError(f"problem '{problem}' has no option '{name}'; known: {known}")
-    out = Path(out_dir)
-    out.mkdir(parents=True, exist_ok=True)
-    head = {"problem": problem, "field": field, "options": options}
-    _claim(out, head)
-    jobs = {v: _Job(registry, problem, field, v, options, str(out), certify) for v in values}
-    done = {v: r for v, job in jobs.items() if (r := _read(out, job.name)) and r.finished}
-    todo = [v for v in values if v not in done]
-    for value in todo:
-        (out / f"{jobs[value].name}.json").unlink(missing_ok=True)
-    with _progress(show) as bar:
-        task = bar.add_task(f"{problem}: {field}", total=len(values), completed=len(done))
-
-        def finished(value: float, result: Result) -> None:
-            done[value] = result
-            best = f"{field} {value:g}: {result.status}, {result.seconds:.0f} s"
-            bar.update(task, advance=1, description=f"{problem}: {best}")
-
-        _run(jobs, todo, min(processes, max(len(todo), 1)), continuation, finished)
-    results = [done[v] for v in values]
-    write_json(out / "sweep.json", {**head, "results": [asdict(r) for r in results]})
+    options = dict(options or {})
+    entry = importlib.import_module(registry).get_problem(problem)
+    values = _checked(problem, entry.config, field, values, options)
+    with workers(processes, cluster) as run:
+        out = Path(out_dir)
+        head = {
+            "problem": problem,
+            "field": field,
+            "options": options,
+            "certify": certify,
+            "track": track,
+            "continuation": continuation,
+        }
+        _claim(out, head)
+        jobs = [
+            Job(
+                name=f"{problem}_{field}_{_label(value)}",
+                problem=problem,
+                options={**options, field: value},
+                registry=registry,
+                value=float(value),
+                certify=certify,
+                track=track,
+            )
+            for value in values
+        ]
+        work = _Work(out, head, jobs, run, show)
+        with work.progress:
+            if continuation:
+                work.one_after_another()
+            else:
+                work.do(jobs)
+                work.try_again()
+        results = work.results()
+        work.write_table()
+    plot(results, field, entry, out / PLOT)
     if show:
-        Console(stderr=True).print(table(results, field))
+        Console(stderr=True).print(table(results, field, entry.unit))
     return results
 
 
-def table(results: Iterable[Result], field: str) -> Table:
-    """The results as a rich table."""
-    out = Table(field, "status", "achieved (m)", "seconds", "effort", "reason")
-    for r in results:
-        achieved = ", ".join(f"{k} {v:.2f}" for k, v in r.achieved.items())
-        effort = "" if r.objective is None else f"{r.objective:.4g}"
-        out.add_row(f"{r.value:g}", r.status, achieved, f"{r.seconds:.1f}", effort, r.reason)
-    return out
+def read_sweep(path: str | Path) -> tuple[dict[str, Any], list[Result]]:
+    """The table of a sweep, from its folder or file: what was swept, and its results.
+
+    Raises ValueError naming the file when it is not such a table.
+    """
+    path = Path(path)
+    path = path / TABLE if path.is_dir() else path
+    try:
+        found = json.loads(path.read_text())
+        return found, [Result(**row) for row in found["results"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not the table of a sweep: {error}") from error
 
 
-@dataclass(frozen=True)
-class _Job:
-    registry: str
-    problem: str
-    field: str
-    value: float
-    options: dict[str, Any]
-    out: str
-    certify: bool
-    guess: str | None = None
+class _Work:
+    """The values of one sweep: what is done, what is not, and how to go on."""
+
+    def __init__(
+        self, out: Path, head: dict[str, Any], jobs: list[Job], run: Run, show: bool
+    ) -> None:
+        self.out, self.head, self.jobs, self.run = out, head, jobs, run
+        self.done: dict[str, Result] = {}
+        """Final results by name of the value's own job."""
+        self.progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=Console(stderr=True),
+            disable=not show,
+        )
+        what = f"{head['problem']}: {head['field']}"
+        self.task = self.progress.add_task(what, total=len(jobs))
+
+    def do(self, jobs: list[Job]) -> None:
+        """Solves what is not on disk already."""
+        kept, todo = left_over(self.out, jobs)
+        for job, result in kept:
+            self._took(job, result, "kept")
+        if todo:
+            self.run(todo, self.out, self._took)
+
+    def one_after_another(self) -> None:
+        """Each value from the nearest one before it that has a motion."""
+        for i, job in enumerate(self.jobs):
+            self.do([self._from(job, self._neighbour(job, self.jobs[:i]))])
+
+    def try_again(self) -> None:
+        """Values without a motion, once more from the nearest that has one."""
+        again = {}
+        for job in self.jobs:
+            near = self._neighbour(job, self.jobs)
+            if self.done[job.name].status in _AGAIN and near is not None:
+                name = f"{job.name}_from_{near.name.removeprefix(self._stem)}"
+                again[name] = (job, dataclasses.replace(self._from(job, near), name=name))
+        if not again:
+            return
+        self.progress.update(self.task, total=len(self.jobs) + len(again))
+        self.do([second for _, second in again.values()])
+        for name, (job, second) in again.items():
+            first, later = self.done[job.name], self.done.pop(name)
+            if later.good:
+                self.done[job.name] = later
+            else:
+                reason = f"{first.reason}; from {second.start}: {later.reason}"
+                self.done[job.name] = dataclasses.replace(first, reason=reason)
+
+    def results(self) -> list[Result]:
+        """In the order of the values."""
+        return [self.done[job.name] for job in self.jobs if job.name in self.done]
+
+    def write_table(self) -> None:
+        """Writes sweep.json with what is known so far."""
+        rows = [asdict(result) for result in self.results()]
+        write_json(self.out / TABLE, {**self.head, "results": rows})
 
     @property
-    def name(self) -> str:
-        return f"{self.problem}_{self.field}_{self.value:g}"
+    def _stem(self) -> str:
+        return f"{self.head['problem']}_{self.head['field']}_"
+
+    def _neighbour(self, job: Job, among: list[Job]) -> Result | None:
+        """The nearest value of these that has a motion; the lower of two as near."""
+
+        def distance(other: Job) -> tuple[float, float]:
+            assert other.value is not None and job.value is not None
+            return abs(other.value - job.value), other.value
+
+        for other in sorted(among, key=distance):
+            found = self.done.get(other.name)
+            if other.name != job.name and found is not None and found.status in GOOD:
+                return found
+        return None
+
+    def _from(self, job: Job, near: Result | None) -> Job:
+        if near is None:
+            return job
+        guess = (self.out / f"{near.name}.npz").read_bytes()
+        return dataclasses.replace(job, start=near.name, guess=guess)
+
+    def _took(self, job: Job, result: Result, how: str = "") -> None:
+        self.done[job.name] = result
+        words = f"{self.head['field']} {result.value:g}: {result.status}"
+        words += f" ({how})" if how else f", {result.seconds:.0f} s"
+        words += f", from {result.start}" if result.start else ""
+        if not self.progress.disable:
+            self.progress.console.print(words, highlight=False)
+        self.progress.update(self.task, advance=1)
+        self.write_table()
 
 
-def _run(
-    jobs: dict[float, _Job],
-    todo: list[float],
-    processes: int,
-    continuation: bool,
-    finished: Callable[[float, Result], None],
-) -> None:
-    """Keeps ``processes`` solves running until nothing is left to do; ends them when interrupted.
-
-    A process of its own for each solve: one that is killed (out of memory, a crash in native
-    code) takes nothing else with it.
-    """
-    context = multiprocessing.get_context("spawn")
-    left = list(todo)
-    running: dict[int, tuple[float, BaseProcess, float]] = {}
-    kept = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))  # children inherit it
-    try:
-        while left or running:
-            while left and len(running) < processes:
-                value = left.pop(0)
-                job = jobs[value]
-                if continuation:
-                    job = dataclasses.replace(job, guess=_neighbour(job, list(jobs)))
-                process = context.Process(target=_child, args=(job,), daemon=True)
-                process.start()
-                running[process.sentinel] = (value, process, time.perf_counter())
-            for sentinel in wait(list(running)):
-                value, process, begun = running.pop(sentinel)  # type: ignore[arg-type]
-                process.join()
-                seconds = time.perf_counter() - begun
-                result = _read(Path(jobs[value].out), jobs[value].name)
-                if process.exitcode != 0 or result is None:
-                    reason = f"its process ended with code {process.exitcode}"
-                    result = Result(jobs[value].name, value, "crashed", reason, seconds, {})
-                    write_json(Path(jobs[value].out) / f"{result.name}.json", asdict(result))
-                finished(value, result)
-    finally:
-        for _, process, _ in running.values():
-            process.terminate()
-        for name, value in kept.items():
-            os.environ.pop(name, None) if value is None else os.environ.update({name: value})
+def _checked(
+    problem: str, config: type, field: str, values: Iterable[float], options: dict[str, Any]
+) -> list[float]:
+    """The values as the field wants them. Raises ValueError for what makes no sweep."""
+    known = {f.name: f.default for f in dataclasses.fields(config)}
+    for name in (field, *options):
+        if name not in known:
+            raise ValueError(f"problem '{problem}' has no option '{name}'; known: {list(known)}")
+    values = [float(v) for v in values]
+    if not values or not all(map(math.isfinite, values)) or len(set(values)) < len(values):
+        raise ValueError(f"a sweep needs different finite values, not {values}")
+    default = known[field]
+    if isinstance(default, bool) or not isinstance(default, int | float):
+        raise ValueError(f"option '{field}' of '{problem}' is not a number, so it cannot be swept")
+    if isinstance(default, int):
+        if not all(v.is_integer() for v in values):
+            raise ValueError(f"option '{field}' of '{problem}' takes whole numbers, not {values}")
+        values = [int(v) for v in values]
+    for value in values:
+        config(**{**options, field: value})  # refuses what no motion could reach, before the work
+    return values
 
 
-def _neighbour(job: _Job, values: list[float]) -> str | None:
-    """The solution file of the nearest value that is on disk."""
-    for value in sorted(values, key=lambda v: abs(v - job.value)):
-        path = Path(job.out) / f"{dataclasses.replace(job, value=value).name}.npz"
-        if value != job.value and path.is_file():
-            return str(path)
-    return None
-
-
-def _child(job: _Job) -> None:
-    """What a spawned process runs: a solve, and its result on disk."""
-    result = _solve(job)
-    write_json(Path(job.out) / f"{result.name}.json", asdict(result))
-
-
-def _solve(job: _Job) -> Result:
-    """One solve, in its own process."""
-    from warmstart.solution import Solution
-
-    begin = time.perf_counter()
-
-    def result(status: str, reason: str = "", **more: Any) -> Result:
-        seconds = time.perf_counter() - begin
-        return Result(
-            job.name, job.value, status, reason, seconds, more.pop("achieved", {}), **more
-        )
-
-    problem = importlib.import_module(job.registry).get_problem(job.problem)
-    try:
-        config = problem.config(**{**job.options, job.field: job.value})
-        guess = Solution.load(job.guess) if job.guess else None
-        solution = problem.solve(config, guess=guess)
-    except Exception as error:
-        if type(error).__name__ in ("Infeasible", "ValueError"):
-            return result("infeasible", str(error))
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        place = f"{Path(where.filename).name}:{where.lineno}"
-        return result("crashed", f"{type(error).__name__} at {place}: {error}")
-    solution.save(Path(job.out) / f"{job.name}.npz")
-    objective = solution.stats.get("objective")
-    if not job.certify:
-        return result("solved", objective=objective)
-    from warmstart.certificate import certify
-
-    certificate = certify(solution)
-    certificate.to_json(Path(job.out) / f"{job.name}.certificate.json")
-    return result(
-        "certified" if certificate.passed else "rejected",
-        "; ".join(certificate.failures),
-        achieved=certificate.achieved,
-        objective=objective,
-    )
+def _label(value: float) -> str:
+    """A value in a file's name; different values have different labels."""
+    return f"{value:g}" if float(f"{value:g}") == value else repr(value)
 
 
 def _claim(out: Path, head: dict[str, Any]) -> None:
-    """Marks a directory as this sweep's. Raises ValueError when it holds another one."""
-    path = out / "sweep.json"
-    if path.is_file():
-        try:
-            found = json.loads(path.read_text())
-            other = {k: found[k] for k in head}
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path} is not a sweep's table; choose another directory") from error
-        if other != json.loads(json.dumps(head)):
-            raise ValueError(
-                f"{out} holds a sweep of {other['problem']} over {other['field']} with options "
-                f"{other['options']}; choose another directory"
-            )
-    else:
+    """Marks a folder as this sweep's. Raises ValueError when it holds another one."""
+    path = out / TABLE
+    if not path.is_file():
         write_json(path, {**head, "results": []})
-
-
-def _read(out: Path, name: str) -> Result | None:
-    """The stored result of a value; None where there is none or it is unreadable."""
+        return
     try:
-        result = Result(**json.loads((out / f"{name}.json").read_text()))
-    except (OSError, ValueError, TypeError):
-        return None
-    solved = result.status in ("certified", "solved", "rejected")
-    return None if solved and not (out / f"{name}.npz").is_file() else result
-
-
-def _progress(show: bool) -> Progress:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    return Progress(*columns, console=Console(stderr=True), disable=not show)
+        found = json.loads(path.read_text())
+        other = {k: found[k] for k in head}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not a sweep's table; choose another folder") from error
+    mine = json.loads(json.dumps(head))
+    if other != mine:
+        differs = next(k for k in mine if other[k] != mine[k])
+        raise ValueError(
+            f"{out} holds a sweep of {other['problem']} over {other['field']} whose {differs} is "
+            f"{other[differs]}, not {mine[differs]}; choose another folder"
+        )
