@@ -40,21 +40,32 @@ class List:
 
 @dataclass(frozen=True)
 class Solve:
-    """Optimise a motion, certify it and track it in MuJoCo.
+    """Optimise a motion, certify it and track it in MuJoCo; or a range of them; or all problems.
 
     Writes demo.npz (the motion), certificate.json and preview.html. An infeasible problem ends
-    with the name of the constraint that stopped it.
+    with the name of the constraint that stopped it; ``--explain`` shows reasons again later.
+    Sweeps and ``--all`` write a table (JSON) and, started again, go on where they were stopped.
     """
 
-    name: Positional[Annotated[str, arg(metavar="PROBLEM")]]
+    name: Positional[Annotated[str, arg(metavar="PROBLEM")]] = ""
     """Optimisation problem; see ``olympics-opt list``."""
-    out: Path
+    out: Path | None = None
     """Folder for the results."""
     sweep: str | None = None
     """Solve for several values of one option, in parallel: ``bar-height=0.8:1.5:8`` (first,
     last, count)."""
+    continuation: bool = False
+    """Take the values of a sweep one after another, each from the nearest motion found before;
+    else each has its own start, and only what then fails is tried from a neighbour."""
+    all: bool = False
+    """Solve every registered problem at its defaults, with a second opinion where one applies."""
+    explain: Path | None = None
+    """Tell of every result in this folder which check failed, by how much and what to try."""
     processes: int = 2
-    """Worker processes of a sweep."""
+    """Worker processes of a sweep and of ``--all``."""
+    cluster: str | None = None
+    """Work on Ray instead of processes: ``local`` (started here), ``auto`` (the cluster of this
+    machine) or an address such as ``ray://HOST:10001``; needs the extra ``cluster``."""
     track: bool = True
     """Follow the motion in MuJoCo with feedback, which makes it a demonstration to learn from."""
     second_opinion: bool = False

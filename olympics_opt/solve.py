@@ -7,6 +7,7 @@ it in MuJoCo with feedback. Only what passed is written as a demonstration.
 from __future__ import annotations
 
 import dataclasses
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,34 +35,125 @@ SOLUTION, DEMO, CERTIFICATE, PREVIEW = (
 def run_solve(config: Solve) -> int:
     """The command: 0 with a demonstration, 1 when the certificate or the tracking refuses it.
 
-    Raises ValueError for an unknown problem or option, or where a second opinion cannot be had,
-    ``Infeasible`` naming the constraint that stopped the optimiser.
+    Raises ValueError for an unknown problem or option, options that do not go together, or where
+    a second opinion cannot be had, ``Infeasible`` naming the constraint that stopped the optimiser.
     """
     from olympics_opt.cli import chosen_options
 
+    _one_thing_at_a_time(config)
+    if config.explain is not None:
+        return _explain(config.explain)
+    assert config.out is not None
+    if config.all:
+        from olympics_opt.solve_all import run_all
+
+        return run_all(config.out, config.processes, config.cluster, config.track)
     problem_config = config.problem  # type: ignore[attr-defined]  # added by the command line
+    if config.sweep is not None:
+        return _run_sweep(config, chosen_options(config, "problem"))
+    return _solve_one(config, problem_config, config.out)
+
+
+def _one_thing_at_a_time(config: Solve) -> None:
+    """Raises ValueError for a command line that asks for nothing, or for two things."""
+    asked = {
+        "PROBLEM": bool(config.name),
+        "--all": config.all,
+        "--explain": config.explain is not None,
+    }
+    chosen = [name for name, given in asked.items() if given]
+    if len(chosen) != 1:
+        what = f"not both {' and '.join(chosen)}" if chosen else "see olympics-opt list"
+        raise ValueError(f"name a problem, or give --all, or --explain FOLDER: {what}")
+    if config.explain is None and config.out is None:
+        raise ValueError("--out FOLDER is needed for the results")
+    many = config.sweep is not None or config.all
+    if config.sweep is not None and not config.name:
+        raise ValueError("--sweep is about one problem: name it")
     if config.sweep is not None and config.second_opinion:
         raise ValueError(
             "a second opinion is about one motion: leave out --sweep or --second-opinion"
         )
-    if config.sweep is not None:
-        return _run_sweep(config, chosen_options(config, "problem"))
-    (config.out / DEMO).unlink(missing_ok=True)  # of an earlier solve with other options
-    solution = optimise(config.name, problem_config, config.out)
-    certificate = certify_solution(solution, config.out)
-    opinion = ask_drake(solution, certificate, config.out) if config.second_opinion else None
+    if config.cluster is not None and not many:
+        raise ValueError("--cluster is for many motions: give --sweep or --all as well")
+    if config.continuation and config.sweep is None:
+        raise ValueError("--continuation goes from value to value: give --sweep as well")
+
+
+def _solve_one(config: Solve, problem_config: Any, out: Path) -> int:
+    """One motion with everything that can be said about it; 0 with a demonstration."""
+    from warmstart.problems import Infeasible
+
+    (out / DEMO).unlink(missing_ok=True)  # of an earlier solve with other options
+    begin = time.perf_counter()
+    try:
+        solution = optimise(config.name, problem_config, out)
+    except Infeasible as error:
+        for name in (SOLUTION, CERTIFICATE, PREVIEW):  # of the earlier solve, too
+            (out / name).unlink(missing_ok=True)
+        seconds = time.perf_counter() - begin
+        _keep_result(config.name, problem_config, out, "infeasible", str(error), seconds)
+        raise
+    certificate = certify_solution(solution, out)
+    opinion = ask_drake(solution, certificate, out) if config.second_opinion else None
     found = None
     if certificate.passed and config.track:
-        found = make_demonstration(solution, certificate, config.out)
+        found = make_demonstration(solution, certificate, out)
     elif certificate.passed:
         from warmstart.clip import clip_from_solution
 
-        clip_from_solution(solution).save(config.out / DEMO)
-    write_preview(solution, certificate, found, config.out / PREVIEW, opinion)
-    _print_outcome(solution, certificate, found, config.out)
+        clip_from_solution(solution).save(out / DEMO)
+    write_preview(solution, certificate, found, out / PREVIEW, opinion)
+    status, reason = "certified", ""
+    if not certificate.passed:
+        status, reason = "rejected", "; ".join(certificate.failures)
+    elif found is not None and not found.passed:
+        status, reason = "untracked", found.reason
+    seconds = time.perf_counter() - begin
+    _keep_result(config.name, problem_config, out, status, reason, seconds, solution, certificate)
+    _print_outcome(solution, certificate, found, out)
     if opinion is not None:
         print(f"second opinion: {opinion.sentence()}")
-    return 0 if (config.out / DEMO).is_file() else 1
+    return 0 if (out / DEMO).is_file() else 1
+
+
+def _keep_result(
+    problem: str,
+    problem_config: Any,
+    out: Path,
+    status: str,
+    reason: str,
+    seconds: float,
+    solution: Solution | None = None,
+    certificate: Certificate | None = None,
+) -> None:
+    """Writes solution.json: what became of the motion, and why."""
+    from warmstart.job import Result, store
+    from warmstart.measure import figures, peak_torques
+    from warmstart.problems import get_problem
+
+    asked = float(getattr(problem_config, get_problem(problem).outcome))
+    name = SOLUTION.removesuffix(".npz")
+    result = Result(name, problem, None, asked, status, reason, seconds)
+    if solution is not None and certificate is not None:
+        result = dataclasses.replace(
+            result,
+            achieved=certificate.achieved,
+            figures=figures(solution),
+            peaks=peak_torques(solution),
+        )
+    store(out, result, {})
+
+
+def _explain(folder: Path) -> int:
+    """Prints why each result of a folder is a demonstration or not."""
+    from warmstart.explain import explain
+
+    cases = explain(folder)
+    for case in sorted(cases, key=lambda case: not case.passed):
+        print("\n".join(case.lines()))
+    print(f"{sum(case.passed for case in cases)} of {len(cases)} passed")
+    return 0
 
 
 def optimise(problem: str, problem_config: Any, out: Path) -> Solution:
@@ -307,9 +399,9 @@ def _print_outcome(
 def _run_sweep(config: Solve, options: dict[str, Any]) -> int:
     """Solves for several values in parallel; 0 when at least one of them is certified."""
     from warmstart.problems import get_problem
-    from warmstart.sweep import sweep
+    from warmstart.sweep import PLOT, TABLE, sweep
 
-    assert config.sweep is not None
+    assert config.sweep is not None and config.out is not None
     field, values = sweep_values(config.sweep)
     if field in options:
         raise ValueError(f"'{field}' is swept, so it cannot be set to {options[field]} as well")
@@ -319,10 +411,16 @@ def _run_sweep(config: Solve, options: dict[str, Any]) -> int:
         values,
         config.out,
         processes=config.processes,
+        cluster=config.cluster,
         options=options,
+        track=config.track,
+        continuation=config.continuation,
     )
     good = sum(r.status == "certified" for r in results)
-    print(f"{good} of {len(results)} values certified; see {config.out / 'sweep.json'}")
+    print(f"{good} of {len(results)} values certified{' and tracked' if config.track else ''}")
+    print(f"wrote {config.out / TABLE}, {config.out / PLOT}")
+    if good < len(results):
+        print(f"olympics-opt solve --explain {config.out} tells what failed and what to try")
     return 0 if good else 1
 
 

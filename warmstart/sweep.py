@@ -6,8 +6,9 @@ last, so a sweep that was killed goes on with what is missing and ends with the 
 
 What a value starts from does not depend on which process was faster. Without ``continuation``
 every value starts from the problem's own guess; a value that then has no certified motion is tried
-once more from the nearest neighbour that has one, and both attempts are kept. With
-``continuation`` the values are taken one after another, each from the nearest one solved before.
+once more from the nearest neighbour that has one. With ``continuation`` the values are taken one
+after another, each from the nearest one solved before; one that then has no motion is tried once
+more from its own start. Every attempt is kept.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from warmstart.atomic import write_json
 from warmstart.job import GOOD, Job, Result, left_over
 from warmstart.sweep_report import plot, table
+from warmstart.sweep_report import show as report
 from warmstart.workers import Run, workers
 
 TABLE, PLOT = "sweep.json", "sweep.png"
@@ -91,12 +93,12 @@ def sweep(
                 work.one_after_another()
             else:
                 work.do(jobs)
-                work.try_again()
+            work.try_again()
         results = work.results()
         work.write_table()
     plot(results, field, entry, out / PLOT)
     if show:
-        Console(stderr=True).print(table(results, field, entry.unit))
+        report(table(results, field, entry.unit), results, Console(stderr=True))
     return results
 
 
@@ -123,6 +125,7 @@ class _Work:
         self.out, self.head, self.jobs, self.run = out, head, jobs, run
         self.done: dict[str, Result] = {}
         """Final results by name of the value's own job."""
+        self._extra = 0
         self.progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -143,28 +146,36 @@ class _Work:
             self.run(todo, self.out, self._took)
 
     def one_after_another(self) -> None:
-        """Each value from the nearest one before it that has a motion."""
+        """Each value from the nearest one before it that has a motion, else from its own start."""
         for i, job in enumerate(self.jobs):
-            self.do([self._from(job, self._neighbour(job, self.jobs[:i]))])
+            near = self._neighbour(job, self.jobs[:i])
+            self.do([self._from(job, near)])
+            if near is not None and self.done[job.name].status in _AGAIN:
+                self._second({f"{job.name}_own": (job, job)})
 
     def try_again(self) -> None:
-        """Values without a motion, once more from the nearest that has one."""
+        """Values without a motion from their own start, once more from the nearest that has one."""
         again = {}
         for job in self.jobs:
             near = self._neighbour(job, self.jobs)
-            if self.done[job.name].status in _AGAIN and near is not None:
+            found = self.done[job.name]
+            if found.status in _AGAIN and not found.start and near is not None:
                 name = f"{job.name}_from_{near.name.removeprefix(self._stem)}"
-                again[name] = (job, dataclasses.replace(self._from(job, near), name=name))
-        if not again:
-            return
-        self.progress.update(self.task, total=len(self.jobs) + len(again))
-        self.do([second for _, second in again.values()])
-        for name, (job, second) in again.items():
+                again[name] = (job, self._from(job, near))
+        self._second(again)
+
+    def _second(self, attempts: dict[str, tuple[Job, Job]]) -> None:
+        """Another start for values without a motion; name -> (the value's job, the attempt)."""
+        self.progress.update(self.task, total=len(self.jobs) + self._extra + len(attempts))
+        self._extra += len(attempts)
+        self.do([dataclasses.replace(second, name=n) for n, (_, second) in attempts.items()])
+        for name, (job, second) in attempts.items():
             first, later = self.done[job.name], self.done.pop(name)
             if later.good:
                 self.done[job.name] = later
             else:
-                reason = f"{first.reason}; from {second.start}: {later.reason}"
+                start = second.start or "its own start"
+                reason = f"{first.reason}; from {start}: {later.reason}"
                 self.done[job.name] = dataclasses.replace(first, reason=reason)
 
     def results(self) -> list[Result]:
@@ -214,23 +225,22 @@ def _checked(
     problem: str, config: type, field: str, values: Iterable[float], options: dict[str, Any]
 ) -> list[float]:
     """The values as the field wants them. Raises ValueError for what makes no sweep."""
-    known = {f.name: f.default for f in dataclasses.fields(config)}
+    known = {f.name: f for f in dataclasses.fields(config)}
     for name in (field, *options):
         if name not in known:
             raise ValueError(f"problem '{problem}' has no option '{name}'; known: {list(known)}")
     values = [float(v) for v in values]
     if not values or not all(map(math.isfinite, values)) or len(set(values)) < len(values):
         raise ValueError(f"a sweep needs different finite values, not {values}")
-    default = known[field]
+    default, whole = known[field].default, known[field].type in (int, "int")
     if isinstance(default, bool) or not isinstance(default, int | float):
         raise ValueError(f"option '{field}' of '{problem}' is not a number, so it cannot be swept")
-    if isinstance(default, int):
-        if not all(v.is_integer() for v in values):
-            raise ValueError(f"option '{field}' of '{problem}' takes whole numbers, not {values}")
-        values = [int(v) for v in values]
-    for value in values:
-        config(**{**options, field: value})  # refuses what no motion could reach, before the work
-    return values
+    if whole and not all(v.is_integer() for v in values):
+        raise ValueError(f"option '{field}' of '{problem}' takes whole numbers, not {values}")
+    kind = int if whole else float
+    for value in values:  # refuses what no motion could reach, before the work
+        config(**{**options, field: kind(value)})
+    return [kind(value) for value in values]
 
 
 def _label(value: float) -> str:

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 
 from warmstart.atomic import write_bytes
@@ -18,11 +21,11 @@ SHOWN = 4
 
 def table(results: Sequence[Result], field: str, unit: str = "") -> Table:
     """The results as a rich table, one row a value; the outcomes of replays are open loop."""
-    of = f" ({unit})" if unit else ""
-    out = Table(
+    of = f"\n({unit})" if unit else ""
+    out = plain_table(
         *(field, f"asked{of}", f"planned{of}", f"MuJoCo{of}", f"Drake{of}", f"tracked{of}"),
-        *("effort (s)", "peak torque (N m)", "solve (s)", "violation", "verdict"),
-        caption="MuJoCo, Drake: replays of the torques, open loop; tracked: with feedback, MuJoCo",
+        *("effort\n(s)", "peak torque\n(N m)", "solve\n(s)", "violation", "verdict"),
+        caption="MuJoCo, Drake: the torques replayed open loop; tracked: with feedback, in MuJoCo",
     )
     for r in results:
         achieved = [
@@ -38,15 +41,30 @@ def table(results: Sequence[Result], field: str, unit: str = "") -> Table:
             f"{peak:.0f} {r.peak_hinge}" if peak is not None else "",
             number(r.figures.get("solve_s", r.seconds)),
             f"{r.figures['violation']:.1e}" if "violation" in r.figures else "",
-            verdict(r),
+            r.status,
         )
     return out
 
 
-def verdict(result: Result) -> str:
-    """Status, start and reason in one line."""
-    start = f" (from {result.start})" if result.start else ""
-    return f"{result.status}{start}{': ' if result.reason else ''}{result.reason}"
+def plain_table(*columns: str, caption: str) -> Table:
+    """A table without frames whose cells are not broken."""
+    out = Table(box=SIMPLE_HEAD, caption=caption, caption_justify="left", padding=(0, 1, 0, 0))
+    for name in columns:
+        out.add_column(name, no_wrap=True)
+    return out
+
+
+def show(table: Table, results: Sequence[Result], console: Console) -> None:
+    """Prints a table at its whole width, and beneath it what a cell has no room for: the reasons
+    of what failed and the starts that are not a problem's own."""
+    wide = console.options.update(width=1000)
+    console.width = max(console.width, Measurement.get(console, wide, table).maximum)
+    console.print(table)
+    for r in results:
+        start = f", from {r.start}" if r.start else ""
+        if r.reason or start:
+            line = f"{r.name}: {r.status}{start}{': ' if r.reason else ''}{r.reason}"
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def number(value: float | None) -> str:

@@ -100,7 +100,7 @@ def ray_cluster(address: str, count: int = 2) -> Iterator[Run]:
         raise ValueError(
             "a cluster needs the package ray: pip install 'olympics-opt[cluster]'"
         ) from None
-    variables = dict.fromkeys(_THREADS, "1")
+    variables: dict[str, str] = dict.fromkeys(_THREADS, "1")
     here = address == "local"
     if here:  # the same modules as here
         variables["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)

@@ -96,6 +96,20 @@ def test_options_of_a_task_reach_its_config():
         ("solve high_jump --out x --problem.bar 1", "--problem.bar-height"),
         ("solve high_jump --out x --problem.bar-height 9", "bar_height"),
         ("solve high_jump --second-opinion --sweep bar-height=1:2:2 --out x", "leave out --sweep"),
+        ("solve --out x", "name a problem"),
+        ("solve high_jump", "--out FOLDER is needed"),
+        ("solve high_jump --all --out x", "not both PROBLEM and --all"),
+        ("solve --all --explain y --out x", "not both --all and --explain"),
+        ("solve --all", "--out FOLDER is needed"),
+        ("solve --explain nowhere", "no folder at nowhere"),
+        ("solve high_jump --cluster auto --out x", "--cluster is for many"),
+        ("solve high_jump --continuation --out x", "--continuation goes from value to value"),
+        ("solve --all --sweep bar-height=1:2:2 --out x", "--sweep is about one problem"),
+        ("solve --all --processes 0 --out x", "at least one process"),
+        ("solve high_jump --sweep bar-height=1:2 --out x", "FIRST:LAST:COUNT"),
+        ("solve high_jump --sweep height=1:2:2 --out x", "no option 'height'"),
+        ("solve high_jump --sweep bar-height=1:9:2 --out x", "between 0.3 and 2.6 m, not 9.0"),
+        ("solve high_jump --sweep strength=1:2:2 --out x", "is not a number"),
         ("study tennis --out x", "tennis"),
         ("export nowhere --out x.safetensors", "no run 'nowhere'"),
         ("export . --out x.bin", "must end in .safetensors"),
@@ -264,6 +278,13 @@ def test_render_wants_something_to_write(capsys):
     assert "--sheet" in sentence_of(capsys, "render", "high_jump", "--policy", "zero")
     line = "render high_jump --policy zero --out picture.gif"
     assert ".mp4" in sentence_of(capsys, *line.split())
+
+
+def test_reasons_are_told_again(capsys):
+    data = Path(__file__).parents[2] / "warmstart" / "data"
+    assert cli.main(["solve", "--explain", str(data)]) == 0
+    out = capsys.readouterr().out
+    assert "high_jump_1m_human: certified" in out and " passed" in out.splitlines()[-1]
 
 
 def test_sweep_values():

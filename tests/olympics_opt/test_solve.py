@@ -15,6 +15,7 @@ from olympics_opt import cli
 from tests.olympics_opt.test_study import standing
 from tests.warmstart.test_drake_nlp import DATA, HELD
 from warmstart.certificate import Certificate
+from warmstart.problems import Infeasible
 from warmstart.solution import Solution
 
 REAL = warmstart.drake_nlp.second_opinion
@@ -50,3 +51,22 @@ def test_without_a_flight_there_is_nothing_to_ask(tmp_path: Path, monkeypatch, c
     assert cli.main([*LINE, str(tmp_path)]) == 2
     assert "no flight after a stance" in capsys.readouterr().err
     assert not (tmp_path / "demo.npz").exists()
+
+
+def test_a_failure_is_kept_with_its_reason_and_told_again(tmp_path: Path, monkeypatch, capsys):
+    """The certificate of an earlier solve with other options does not stay beside it."""
+
+    def impossible(problem: str, config: object, out: Path) -> Solution:
+        raise Infeasible("a bar at 2.4 m is infeasible: L_Ankle_y 137 %")
+
+    monkeypatch.setattr("olympics_opt.solve.optimise", impossible)
+    for name in ("certificate.json", "demo.npz", "solution.npz"):
+        (tmp_path / name).write_text("of another bar")
+    line = ["solve", "high_jump", "--problem.bar-height", "2.4", "--out", str(tmp_path)]
+    assert cli.main(line) == 2
+    assert "L_Ankle_y 137 %" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["solution.json"]
+    assert cli.main(["solve", "--explain", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "infeasible (high_jump, asked 2.4)" in out and "L_Ankle_y 137 %" in out
+    assert "0 of 1 passed" in out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -14,12 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from tests.warmstart.fakes import FAKE
 from warmstart.job import Result, read_result
 from warmstart.solution import Solution
 from warmstart.sweep import read_sweep, sweep
-from warmstart.sweep_report import table
+from warmstart.sweep_report import show, table
 
 
 @pytest.fixture
@@ -56,9 +58,12 @@ def test_failures_are_kept_and_the_rest_goes_on(fake, tmp_path):
     assert solution.asked == {"bar_height": 0.8}
     with Image.open(tmp_path / "out" / "sweep.png") as image:
         assert image.format == "PNG"
-    shown = table(results, "bar_height", "m")
-    verdicts = list(shown.columns[-1].cells)
-    assert "torque of L_Knee_y" in verdicts[0] and verdicts[1] == "solved"
+    written = io.StringIO()
+    show(table(results, "bar_height", "m"), results, Console(file=written, width=40))
+    lines = written.getvalue().splitlines()
+    whole = ["0.8", "0.8", "1.0e-07", "solved"]  # a narrow terminal breaks no cell
+    assert any(line.split()[:2] == whole[:2] and line.split()[-2:] == whole[-2:] for line in lines)
+    assert any(line.startswith("high_jump_bar_height_3: infeasible: no motion") for line in lines)
 
 
 def test_figures_of_a_constant_torque(fake, tmp_path):
@@ -151,6 +156,16 @@ def test_continuation_starts_from_the_nearest_value_before(fake, tmp_path):
     assert fake[1].read_text() == "0.8 None\n1 0.8\n1.5 1.0\n0.7 0.8\n"
 
 
+def test_what_fails_from_a_neighbour_is_tried_from_its_own_start(fake, tmp_path):
+    values, out = [3.0, 1.0, 1.8], tmp_path / "out"
+    results = run(fake, out, values, {"picky": True}, continuation=True)
+    lines = ["3 None", "1 None", "1.8 1.0", "1.8 None", "3 1.8"]
+    assert fake[1].read_text().split("\n")[:-1] == lines
+    assert [r.name.split("_")[-1] for r in results] == ["3", "1", "own"]
+    assert [r.status for r in results] == ["infeasible", "solved", "solved"]
+    assert "torque of L_Knee_y" in results[0].reason and "too far off" in results[0].reason
+
+
 def test_what_makes_no_sweep_is_refused_and_nothing_is_written(fake, tmp_path):
     out = tmp_path / "out"
     for values in ([], [1.0, 1.0], [float("nan")]):
@@ -169,7 +184,7 @@ def test_what_makes_no_sweep_is_refused_and_nothing_is_written(fake, tmp_path):
         sweep("golf", "x", [1.0], out, registry=fake[0])
     assert not out.exists()
     run(fake, out, [0.8])
-    with pytest.raises(ValueError, match="holds a sweep of high_jump.*options"):
+    with pytest.raises(ValueError, match=r"holds a sweep of high_jump.*options"):
         run(fake, out, [0.8], {"fussy": True})
     with pytest.raises(ValueError, match="not the table of a sweep"):
         read_sweep(tmp_path / "nowhere")
