@@ -19,6 +19,7 @@ import json
 import math
 from collections.abc import Iterable
 from dataclasses import asdict
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -266,3 +267,16 @@ def _claim(out: Path, head: dict[str, Any]) -> None:
             f"{out} holds a sweep of {other['problem']} over {other['field']} whose {differs} is "
             f"{other[differs]}, not {mine[differs]}; choose another folder"
         )
+
+
+def shipped_sweep(problem: str, field: str) -> list[Result]:
+    """The results of a sweep that is shipped as package data, to study without a solver.
+
+    Raises ValueError naming those that there are.
+    """
+    folder = Path(str(resources.files("warmstart").joinpath("data", "sweeps")))
+    path = folder / f"{problem}_{field}.json"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in folder.glob("*.json")))
+        raise ValueError(f"no sweep of {problem} over {field} is shipped; there are: {known}")
+    return read_sweep(path)[1]

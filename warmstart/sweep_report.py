@@ -101,7 +101,7 @@ def plot(results: Sequence[Result], field: str, problem: Any, path: Path) -> Pat
 
     line(axes[0], lambda r: r.figures.get("effort"), "effort")
     axes[0].set(title="Effort", ylabel="sum of squared shares of the limits (s)")
-    axes[0].set_ylim(bottom=0)
+    axes[0].set_ylim(0, 1.1 * axes[0].get_ylim()[1])
     largest: dict[str, float] = {}
     for r in moved:
         for name, value in r.peaks.items():
@@ -109,12 +109,15 @@ def plot(results: Sequence[Result], field: str, problem: Any, path: Path) -> Pat
     for name in sorted(largest, key=lambda n: -largest[n])[:SHOWN]:
         line(axes[1], lambda r, name=name: r.peaks.get(name), name.replace("_", " "))
     axes[1].set(title="Largest torques", ylabel="N m")
-    axes[1].set_ylim(bottom=0)
+    axes[1].set_ylim(0, 1.1 * axes[1].get_ylim()[1])
     names = {"planned": "planned", "replay_mujoco": "MuJoCo, open loop"}
     names |= {"replay_drake": "Drake, open loop", "tracked": "MuJoCo, with feedback"}
     for name, label in names.items():
         if any(name in r.achieved for r in moved):
-            line(axes[2], lambda r, name=name: r.achieved.get(name), label)
+            line(axes[2], lambda r, name=name: r.achieved.get(name) or None, label)
+            color = axes[2].lines[-1].get_color()
+            missed = [r.value for r in moved if r.achieved.get(name) == 0.0]
+            axes[2].plot(missed, [0.0] * len(missed), "x", color=color)  # no valid attempt
     asked = [(r.value, r.asked) for r in rows if r.asked is not None]
     axes[2].plot([p[0] for p in asked], [p[1] for p in asked], "k:", label="asked")
     axes[2].set(title="Outcome", ylabel=f"{problem.outcome.replace('_', ' ')} ({problem.unit})")

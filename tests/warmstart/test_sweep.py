@@ -20,7 +20,7 @@ from rich.console import Console
 from tests.warmstart.fakes import FAKE
 from warmstart.job import Result, read_result
 from warmstart.solution import Solution
-from warmstart.sweep import read_sweep, sweep
+from warmstart.sweep import read_sweep, shipped_sweep, sweep
 from warmstart.sweep_report import show, table
 
 
@@ -232,3 +232,18 @@ def test_a_cluster_without_ray_or_an_answer_is_a_sentence(fake, tmp_path, monkey
     with pytest.raises(ValueError, match=r"olympics-opt\[cluster\]"):
         run(fake, tmp_path / "out", [1.0], cluster="local")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_shipped_sweep_is_of_certified_jumps():
+    """What a notebook reads without a solver: planned near what was asked, in the values' order."""
+    jumps = shipped_sweep("long_jump", "length")
+    assert len(jumps) >= 9 and all(r.status == "certified" for r in jumps)
+    for r in jumps:
+        assert r.achieved["planned"] == pytest.approx(r.value, abs=0.1)
+        # The flight of its centre of mass, in the time that it took, is most of the length.
+        angle = np.radians(r.figures["takeoff_angle"])
+        flown = r.figures["takeoff_speed"] * np.cos(angle) * r.figures["flight_time"]
+        assert 0.0 < r.achieved["planned"] - flown < 1.0
+        assert r.figures["peak_torque"] == pytest.approx(max(r.peaks.values()))
+    with pytest.raises(ValueError, match="long_jump_length"):
+        shipped_sweep("golf", "speed")
