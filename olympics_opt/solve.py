@@ -39,18 +39,17 @@ def run_solve(config: Solve) -> int:
     a second opinion cannot be had, ``Infeasible`` naming the constraint that stopped the optimiser.
     """
     from olympics_opt.cli import chosen_options
+    from olympics_opt.solve_many import run_all, run_sweep
 
     _one_thing_at_a_time(config)
     if config.explain is not None:
         return _explain(config.explain)
     assert config.out is not None
     if config.all:
-        from olympics_opt.solve_all import run_all
-
         return run_all(config.out, config.processes, config.cluster, config.track)
     problem_config = config.problem  # type: ignore[attr-defined]  # added by the command line
     if config.sweep is not None:
-        return _run_sweep(config, chosen_options(config, "problem"))
+        return run_sweep(config, chosen_options(config, "problem"))
     return _solve_one(config, problem_config, config.out)
 
 
@@ -394,44 +393,3 @@ def _print_outcome(
         print(f"certified, but no demonstration is written: {found.reason}")
     names = (n for n in (DEMO, CERTIFICATE, PREVIEW) if (out / n).is_file())
     print(f"wrote {', '.join(str(out / n) for n in names)}")
-
-
-def _run_sweep(config: Solve, options: dict[str, Any]) -> int:
-    """Solves for several values in parallel; 0 when at least one of them is certified."""
-    from warmstart.problems import get_problem
-    from warmstart.sweep import PLOT, TABLE, sweep
-
-    assert config.sweep is not None and config.out is not None
-    field, values = sweep_values(config.sweep)
-    if field in options:
-        raise ValueError(f"'{field}' is swept, so it cannot be set to {options[field]} as well")
-    results = sweep(
-        get_problem(config.name).name,
-        field,
-        values,
-        config.out,
-        processes=config.processes,
-        cluster=config.cluster,
-        options=options,
-        track=config.track,
-        continuation=config.continuation,
-    )
-    good = sum(r.status == "certified" for r in results)
-    print(f"{good} of {len(results)} values certified{' and tracked' if config.track else ''}")
-    print(f"wrote {config.out / TABLE}, {config.out / PLOT}")
-    if good < len(results):
-        print(f"olympics-opt solve --explain {config.out} tells what failed and what to try")
-    return 0 if good else 1
-
-
-def sweep_values(text: str) -> tuple[str, list[float]]:
-    """``bar-height=0.8:1.5:8`` -> field and values. Raises ValueError for any other form."""
-    name, _, numbers = text.partition("=")
-    try:
-        low, high, count = numbers.split(":")
-        values = np.linspace(float(low), float(high), int(count))
-    except ValueError:
-        raise ValueError(
-            f"a sweep is NAME=FIRST:LAST:COUNT, such as bar-height=0.8:1.5:8, not '{text}'"
-        ) from None
-    return name.strip().replace("-", "_"), [round(float(v), 9) for v in values]

@@ -288,7 +288,7 @@ def test_reasons_are_told_again(capsys):
 
 
 def test_sweep_values():
-    from olympics_opt.solve import sweep_values
+    from olympics_opt.solve_many import sweep_values
 
     assert sweep_values("bar-height=0.8:1.4:3") == ("bar_height", [0.8, 1.1, 1.4])
     with pytest.raises(ValueError, match="FIRST:LAST:COUNT"):

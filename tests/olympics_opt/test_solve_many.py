@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from olympics_opt.solve_all import solve_all
+from olympics_opt.solve_many import solve_all
 from tests.warmstart.fakes import FAKE
 from warmstart.explain import explain
 from warmstart.problems import PROBLEMS

@@ -1,8 +1,9 @@
-"""``olympics-opt solve --all``: every registered problem at its defaults, in one table.
+"""Many motions with one command: ``solve PROBLEM --sweep`` and ``solve --all``.
 
-The folder holds each problem's files (see :mod:`warmstart.job`) and ``warmstart.json``, the table
-with commit, hardware and versions, which is what ``results/warmstart.json`` is made of. What an
-earlier run finished is kept; a row says at which commit it was made.
+``--all`` solves every registered problem at its defaults. The folder holds each problem's files
+(see :mod:`warmstart.job`) and ``warmstart.json``, the table with commit, hardware and versions,
+which is what ``results/warmstart.json`` is made of. What an earlier run finished is kept; a row
+says at which commit it was made.
 """
 
 from __future__ import annotations
@@ -12,12 +13,58 @@ import json
 import platform
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from warmstart.job import Job, Result, left_over
 
+if TYPE_CHECKING:
+    from olympics_opt.cli import Solve
+
 TABLE = "warmstart.json"
 KIND = "olympics-opt solve --all"
+
+
+def run_sweep(config: Solve, options: dict[str, Any]) -> int:
+    """Solves for several values in parallel; 0 when at least one of them is certified."""
+    from warmstart import sweep
+    from warmstart.problems import get_problem
+
+    assert config.sweep is not None and config.out is not None
+    field, values = sweep_values(config.sweep)
+    if field in options:
+        raise ValueError(f"'{field}' is swept, so it cannot be set to {options[field]} as well")
+    results = sweep.sweep(
+        get_problem(config.name).name,
+        field,
+        values,
+        config.out,
+        processes=config.processes,
+        cluster=config.cluster,
+        options=options,
+        track=config.track,
+        continuation=config.continuation,
+    )
+    good = sum(r.status == "certified" for r in results)
+    print(f"{good} of {len(results)} values certified{' and tracked' if config.track else ''}")
+    print(f"wrote {config.out / sweep.TABLE}, {config.out / sweep.PLOT}")
+    if good < len(results):
+        print(f"olympics-opt solve --explain {config.out} tells what failed and what to try")
+    return 0 if good else 1
+
+
+def sweep_values(text: str) -> tuple[str, list[float]]:
+    """``bar-height=0.8:1.5:8`` -> field and values. Raises ValueError for any other form."""
+    name, _, numbers = text.partition("=")
+    try:
+        low, high, count = numbers.split(":")
+        values = np.linspace(float(low), float(high), int(count))
+    except ValueError:
+        raise ValueError(
+            f"a sweep is NAME=FIRST:LAST:COUNT, such as bar-height=0.8:1.5:8, not '{text}'"
+        ) from None
+    return name.strip().replace("-", "_"), [round(float(v), 9) for v in values]
 
 
 def run_all(out: Path, processes: int, cluster: str | None, track: bool) -> int:
@@ -70,8 +117,9 @@ def solve_all(
 
         def took(job: Job, result: Result) -> None:
             done[job.name] = result
-            words = f"{job.name}: {result.status} in {result.seconds:.0f} s"
-            bar.show(words, len(done), len(jobs))
+            bar.show(f"{len(done)} of {len(jobs)}", len(done), len(jobs))
+            if show:
+                print(f"{job.name}: {result.status} in {result.seconds:.0f} s", flush=True)
             _write(out / TABLE, settings, done, problems)
 
         kept, todo = left_over(out, jobs)
