@@ -35,6 +35,7 @@ ADVICE: dict[str, str] = {
     "or start from another neighbour",
     "beyond a joint limit": "a joint leaves its range between two knots: raise detail",
     "planned outcome": "the motion does not do what its sport asks for: solve it again",
+    "planned ": "between the knots the motion is off what was asked: raise detail",
     "clearance over the bar": "the body touches the bar between two knots: raise clearance or "
     "detail",
     "foremost contact": "the take-off is a foul: raise board",
