@@ -30,8 +30,10 @@ import numpy as np
 from sports.humanoid.mjcf import body_name, build_model
 from sports.physics.base import GRAVITY
 from sports.scene import humanoid_scene
+from warmstart import strike
 from warmstart.atomic import write_text
 from warmstart.inverse_dynamics import inverse_dynamics_drake, inverse_dynamics_mujoco
+from warmstart.judged import RULES
 from warmstart.outcome import OUTCOMES, support
 from warmstart.replay import replay
 from warmstart.solution import Solution
@@ -83,6 +85,13 @@ PROBLEM_LIMITS: dict[str, dict[str, tuple[str, float, str]]] = {
 }
 
 
+def required(problem: str) -> dict[str, tuple[str, float, str]]:
+    """What a certificate of a problem must list; one of an unknown problem cannot pass."""
+    if problem in RULES:
+        return LIMITS | strike.limits(RULES[problem])
+    return LIMITS | PROBLEM_LIMITS.get(problem, {"problem is known": ("<=", 0.0, "")})
+
+
 @dataclass(frozen=True)
 class Check:
     """One figure against its limit."""
@@ -116,7 +125,7 @@ class Certificate:
     asked: dict[str, float]
     strength: str
     achieved: dict[str, float]
-    """``planned``, ``replay_mujoco``, ``replay_drake``: the outcome (m); 0 for a replay that made
+    """``planned``, ``replay_mujoco``, ``replay_drake``: the outcome (m; m/s of a strike); 0 for a replay that made
     no valid attempt (open loop, a jump may fall), missing if it could not be computed."""
     checks: tuple[Check, ...]
     stats: dict[str, Any]
@@ -124,7 +133,7 @@ class Certificate:
     @property
     def required(self) -> dict[str, tuple[str, float, str]]:
         """What a certificate of this problem must list."""
-        return LIMITS | PROBLEM_LIMITS.get(self.problem, {"problem is known": ("<=", 0.0, "")})
+        return required(self.problem)
 
     @property
     def passed(self) -> bool:
@@ -231,10 +240,9 @@ def certify(solution: Solution) -> Certificate:
             figures |= compute()
         except Exception as error:  # fail-closed: whatever goes wrong, the check is missing
             broken.append(f"{name}: {type(error).__name__}: {error}")
-    required = LIMITS | PROBLEM_LIMITS.get(solution.problem, {"problem is known": ("<=", 0.0, "")})
     checks = tuple(
         Check(name, float(figures.get(name, math.nan)), sense, limit, unit, notes.get(name, ""))
-        for name, (sense, limit, unit) in required.items()
+        for name, (sense, limit, unit) in required(solution.problem).items()
     )
     stats = {k: v for k, v in solution.stats.items() if isinstance(v, int | float | str | bool)}
     return Certificate(
@@ -401,6 +409,10 @@ def _touch_down(solution: Solution) -> dict[str, float]:
 
 
 def _outcome(solution: Solution, achieved: dict[str, float]) -> dict[str, float]:
+    if solution.problem in RULES:
+        found = strike.planned(RULES[solution.problem], solution, fine_times(solution))
+        achieved["planned"] = found["planned outcome"]
+        return found
     outcome = OUTCOMES[solution.problem]
     times = fine_times(solution)
     motion = solution.sample(times)
@@ -412,14 +424,23 @@ def _outcome(solution: Solution, achieved: dict[str, float]) -> dict[str, float]
 
 
 def _replay(solution: Solution, engine: str, achieved: dict[str, float]) -> dict[str, float]:
+    if solution.problem in RULES:
+        times, qpos, found = strike.replayed(RULES[solution.problem], solution, engine)
+        achieved[f"replay_{engine}"] = found[f"replay in {engine}: outcome"]
+        return found | _root_error(solution, engine, times, qpos)
     times, qpos = replay(solution, engine)
     outcome = OUTCOMES[solution.problem].measure(solution.body, times, qpos)
     outcome = outcome if math.isfinite(outcome) else 0.0  # a failed attempt achieves nothing
     achieved[f"replay_{engine}"] = outcome
+    found = {f"replay in {engine}: outcome": outcome}
+    return found | _root_error(solution, engine, times, qpos)
+
+
+def _root_error(
+    solution: Solution, engine: str, times: np.ndarray, qpos: np.ndarray
+) -> dict[str, float]:
+    """Largest distance of a replay's root from the planned one."""
     inside = times <= solution.duration
     planned = solution.sample(solution.times[0] + times[inside])["qpos"]
     error = np.linalg.norm(qpos[inside, :3] - planned[:, :3], axis=1)
-    return {
-        f"replay in {engine}: outcome": outcome,
-        f"replay in {engine}: root error": float(error.max()),
-    }
+    return {f"replay in {engine}: root error": float(error.max())}

@@ -44,6 +44,9 @@ class Weights:
     """On the integral of the squared rate of torque over its limit (per s)."""
     force_rate: float = 2e-4
     """On the integral of the squared rate of force over body weight (per s)."""
+    shear: float = 0.0
+    """On the integral of squared horizontal force at contact points over body weight. Feet that
+    push against each other save effort, but the soft friction of engines creeps under load."""
     acceleration: float = 2e-3
     """On the integral of squared joint acceleration over 50 rad/s^2."""
     acceleration_rate: float = 4e-4

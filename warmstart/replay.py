@@ -34,7 +34,25 @@ def replay(
     Returns times (T,) s from the first frame and qpos (T, 7 + n). Raises RuntimeError when the
     simulation diverges.
     """
-    scene = scene or humanoid_scene(solution.body, timestep=1.0 / REPLAY_RATE, substeps=1)
+    times, qpos, _ = replay_states(solution, engine, hold, scene)
+    return times, qpos
+
+
+def replay_states(
+    solution: Solution,
+    engine: str,
+    hold: float = 0.5,
+    scene: Scene | None = None,
+    objects: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same with qvel (T, nv), in a ``scene`` stepped at ``REPLAY_RATE`` or alone on the ground.
+
+    ``objects``: qpos and qvel of the scene's free objects at the first frame, one after the other;
+    theirs follow the athlete's in what is returned.
+    """
+    scene = scene or humanoid_scene(solution.body)
+    scene = replace(scene, timestep=1.0 / REPLAY_RATE, substeps=1)
+    things = objects or (np.zeros(0), np.zeros(0))
     physics = make_physics(engine, scene, 1)
     planned = math.floor(solution.duration * REPLAY_RATE)
     steps = planned + round(hold * REPLAY_RATE)
@@ -42,19 +60,21 @@ def replay(
     motion = solution.sample(solution.times[0] + middle)
     targets = motion["qpos"][:, 7:] + motion["torque"] / solution.body.array("kp")
     state = PhysicsState(
-        torch.tensor(solution.qpos[:1], dtype=torch.float32),
-        torch.tensor(solution.qvel[:1], dtype=torch.float32),
+        torch.tensor(np.concatenate([solution.qpos[0], things[0]])[None], dtype=torch.float32),
+        torch.tensor(np.concatenate([solution.qvel[0], things[1]])[None], dtype=torch.float32),
         torch.zeros(1, 0, 3),
     )
     physics.reset(torch.ones(1, dtype=torch.bool), state)
     out = [physics.qpos[0].double().numpy().copy()]
+    rates = [physics.qvel[0].double().numpy().copy()]
     for target in targets:
         physics.step(torch.tensor(target[None], dtype=torch.float32))
         if bool(physics.bad.any()):
             raise RuntimeError(f"the replay diverged in {engine} after {len(out)} steps")
         out.append(physics.qpos[0].double().numpy().copy())
+        rates.append(physics.qvel[0].double().numpy().copy())
     physics.close()
-    return np.arange(len(out)) / REPLAY_RATE, np.array(out)
+    return np.arange(len(out)) / REPLAY_RATE, np.array(out), np.array(rates)
 
 
 def scene_options(clip: Clip) -> dict[str, Any]:

@@ -42,7 +42,9 @@ class Transcription:
         flight_limits: Sequence[str] = (),
         parameters: int = 0,
         elastic: bool = False,
+        standing: bool = False,
     ) -> None:
+        self.standing = standing
         self.body, self.model, self.phases = body, model, tuple(phases)
         self.bounds, self.weights = bounds, weights or Weights()
         self.held_limits, self.flight_limits = tuple(held_limits), tuple(flight_limits)
@@ -71,9 +73,10 @@ class Transcription:
     def mode_points(self, side: str, knot: int) -> tuple[int, ...]:
         """Sole points of a side that may push at a knot: both neighbours agree.
 
-        The motion begins in the air: at the first knot a foot touches but does not push yet.
+        A motion that does not begin ``standing`` begins in the air: at the first knot a foot
+        touches but does not push yet.
         """
-        active = set(range(6)) if knot else set()
+        active = set(range(6)) if knot or self.standing else set()
         for i, phase in enumerate(self.phases):
             if self.ends[i] <= knot <= self.ends[i + 1]:
                 active &= set(MODES[phase.feet[side]] if side in phase.feet else ())
@@ -259,7 +262,11 @@ class Transcription:
             pairs = [k for k in self.f[side] if k + 1 in self.f[side]]
 
             def force_rate(f0, f1, h, p):
-                return w.force_rate * ca.sumsqr((f1 - f0) / self.weight) / (h * p[-1]), []
+                cost = w.force_rate * ca.sumsqr((f1 - f0) / self.weight) / (h * p[-1])
+                if w.shear:
+                    level = ca.reshape((f0 + f1) / (2 * self.weight), 3, 6)[:2, :]
+                    cost += w.shear * h * p[-1] * ca.sumsqr(level)
+                return cost, []
 
             f0 = np.array([self.f[side][k].ravel() for k in pairs])
             f1 = np.array([self.f[side][k + 1].ravel() for k in pairs])
@@ -384,7 +391,8 @@ class Transcription:
             for k, index in self.f[side].items():
                 active = self.mode_points(side, k)
                 for point in active:
-                    x[index[point, 2]] = 2 * self.weight / len(active)
+                    feet = len(self.sides) if self.standing else 0.5  # a take-off: twice the weight
+                    x[index[point, 2]] = self.weight / feet / len(active)
         return self._guess_rest(x)
 
     def _guess_rest(self, x: np.ndarray) -> np.ndarray:

@@ -1,0 +1,40 @@
+"""How the strikes and throws are judged, by problem."""
+
+from __future__ import annotations
+
+from sports import tennis
+from warmstart import shot
+from warmstart.solution import Solution
+from warmstart.strike import Moment, Rules
+
+
+def _tennis(solution: Solution, found: Moment) -> dict[str, float]:
+    scene = tennis.scene(tennis.Tennis(), solution.body)
+    return shot.followed(tennis.GAME, scene, solution, found)
+
+
+def _tennis_played(solution: Solution, engine: str) -> dict[str, float]:
+    scene = tennis.scene(tennis.Tennis(), solution.body)
+    return shot.played(tennis.GAME, scene, solution, engine)
+
+
+_BALL: dict[str, tuple[str, float, str]] = {
+    "planned landing off target": ("<=", 0.5, "m"),
+    "planned over the net": (">=", 0.0, "m"),
+    **{
+        f"replay in {engine}: {name}": ("recorded", float("nan"), unit)
+        for engine in ("mujoco", "drake")
+        for name, unit in (
+            ("landing off target", "m"),
+            ("over the net", "m"),
+            ("ball: speed", "m/s"),
+            ("ball: landing off target", "m"),
+            ("ball: over the net", "m"),
+        )
+    },
+}
+
+RULES: dict[str, Rules] = {
+    "tennis": Rules("ball_speed", "m/s", True, _tennis, _tennis_played, _BALL),
+}
+"""By problem."""

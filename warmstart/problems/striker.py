@@ -1,0 +1,378 @@
+"""What strikes and throws share: an athlete on its feet, and what its hand does at one moment.
+
+The athlete starts at rest on both feet, in its own frame (feet about the origin, facing +x). At
+the end of the phase ``swing`` a point of a link has a prescribed place, velocity and direction (an
+:class:`Event`); the phase ``follow`` brings everything near rest. Effort is minimal. A problem
+turns its outcome into an event, and puts the finished motion where its sport has it
+(:func:`placed`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from sports.humanoid.body import Body, Strength
+from warmstart import rotation
+from warmstart.contact import Ball
+from warmstart.nlp import Result
+from warmstart.phases import Bounds, Phase, Weights
+from warmstart.problems import jumper
+from warmstart.rigid_body import ReducedModel, center_of_mass, load_tree, reduce_tree
+from warmstart.separation import axis_balls
+from warmstart.solution import Solution
+from warmstart.transcription import Transcription
+
+LEGS = ("Hip_x", "Hip_y", "Hip_z", "Knee_y", "Ankle_x", "Ankle_y", "Toe_y")
+FREE = (
+    *(f"{side}_{joint}" for side in "LR" for joint in LEGS),
+    *(f"Torso_{axis}" for axis in "xyz"),
+    *("Spine_z", "Chest_y", "Chest_z"),
+    *(f"{side}_Shoulder_{axis}" for side in "LR" for axis in "xyz"),
+    *("L_Elbow_z", "R_Elbow_y", "R_Elbow_z"),
+    *("R_Wrist_x", "R_Wrist_y", "R_Wrist_z"),
+)
+"""32 hinges: with the root the 38 degrees of freedom of a stroke."""
+HELD_LIMITS = (
+    *("R_Thorax_x", "R_Thorax_y", "R_Thorax_z", "R_Elbow_x"),
+    *("R_Hand_x", "R_Hand_y", "R_Hand_z"),
+    *(f"{side}_{dof}" for side in "LR" for dof in ("Knee_x", "Knee_z", "Ankle_z")),
+)
+"""Held joints whose holding torque comes near its limit and is therefore bounded."""
+POSITION = {
+    "pitch": (-0.35, 0.6),
+    "roll": (-0.4, 0.4),
+    "yaw": (-1.4, 1.4),
+    "Hip_x": (-0.7, 0.7),
+    "Hip_y": (-1.4, 0.6),
+    "Hip_z": (-0.8, 0.8),
+    "Knee_y": (0.2, 1.6),
+    "Ankle_x": (-0.4, 0.4),
+    "Ankle_y": (-0.7, 0.6),
+    "Toe_y": (-0.9, 0.2),
+    "Torso_x": (-0.25, 0.25),
+    "Torso_y": (-0.25, 0.45),
+    "Torso_z": (-0.45, 0.45),
+    "Spine_z": (-0.35, 0.35),
+    "Chest_y": (-0.2, 0.35),
+    "Chest_z": (-0.4, 0.4),
+    "L_Shoulder_x": (-1.45, 0.9),
+    "L_Shoulder_y": (-1.2, 1.2),
+    "L_Shoulder_z": (-1.9, 0.0),
+    "L_Elbow_z": (-2.4, -0.1),
+    "R_Shoulder_x": (-0.9, 1.45),
+    "R_Shoulder_y": (-1.2, 1.2),
+    "R_Shoulder_z": (-0.9, 1.9),
+    "R_Elbow_y": (-0.9, 0.9),
+    "R_Elbow_z": (0.1, 2.4),
+    "R_Wrist_x": (-0.6, 0.6),
+    "R_Wrist_y": (-1.2, 1.2),
+    "R_Wrist_z": (-0.9, 0.9),
+}
+"""Pose boxes (rad). A right arm is lowered by positive shoulder x and swings forward with positive
+shoulder z; a positive right elbow z bends it; left signs are opposite."""
+RATE = {
+    "x": (-3.0, 3.0),
+    "y": (-2.0, 2.0),
+    "z": (-2.0, 2.0),
+    "pitch": (-4.0, 4.0),
+    "roll": (-4.0, 4.0),
+    "yaw": (-9.0, 9.0),
+}
+"""Rate boxes of the root (m/s, rad/s)."""
+
+
+SHEAR = 30.0
+"""Weight of the horizontal force on each foot."""
+TRUNK = ("Pelvis", "Torso", "Chest", "Head")
+COMFORT = {
+    **{name: 0.0 for name in ("pitch", "roll", "Torso_x", "Torso_y", "Chest_y")},
+    **{f"{side}_Hip_{axis}": 0.0 for side in "LR" for axis in "xz"},
+    "L_Shoulder_x": -1.1,
+    "L_Shoulder_z": -0.5,
+    "L_Elbow_z": -1.0,
+}
+"""Angles (rad) to which a small price draws the posture: upright, and an idle arm at rest."""
+PRICE = 4e-3
+"""Cost of a squared radian off :data:`COMFORT` at one knot."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of all strikes and throws. Raises ValueError for values that none accepts."""
+
+    strength: Strength = "human"
+    """Torque limits: ``human`` (with torque-speed lines) or ``paper``."""
+    detail: float = 1.0
+    """Knots relative to the standard grid; below 1 solves faster and is less exact."""
+    max_iterations: int = 300
+    """IPOPT iterations before giving up."""
+
+    def __post_init__(self) -> None:
+        if not 0.3 <= self.detail <= 4.0:
+            raise ValueError(f"detail must lie between 0.3 and 4, not {self.detail}")
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations must be at least 1, not {self.max_iterations}")
+
+
+@dataclass(frozen=True)
+class Event:
+    """What a point of a link does at the moment of the strike or the release.
+
+    In the frame of the athlete: x forward, y left, z up, feet about the origin (m, m/s).
+    """
+
+    link: str
+    point: tuple[float, float, float]
+    """In the link's frame (m)."""
+    axis: tuple[float, float, float]
+    """A direction of the link (unit, its frame) that must point along ``normal``."""
+    place: tuple[float, float, float]
+    velocity: tuple[float, float, float]
+    normal: tuple[float, float, float]
+
+    def parameters(self) -> list[float]:
+        """The program's parameters: place, velocity, normal and two directions across it."""
+        n = np.array(self.normal) / np.linalg.norm(self.normal)
+        across = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
+        across /= np.linalg.norm(across)
+        rows = (self.place, self.velocity, n, across, np.cross(n, across))
+        return [float(x) for row in rows for x in row]
+
+    def at(self, time: float, x: float, y: float, yaw: float) -> dict[str, object]:
+        """The event in a solution's stats: at its time, in the world where :func:`placed` puts it."""
+        turn = rotation.exp(np.array([0.0, 0.0, yaw]))
+        place, velocity, normal = (
+            rotation.rotate(turn, np.array(v)) for v in (self.place, self.velocity, self.normal)
+        )
+        return {
+            "time": time,
+            "link": self.link,
+            "point": list(self.point),
+            "axis": list(self.axis),
+            "place": (place + np.array([x, y, 0.0])).tolist(),
+            "velocity": velocity.tolist(),
+            "normal": normal.tolist(),
+        }
+
+
+PARAMETERS = 15
+
+
+def boxes(
+    table: Mapping[str, tuple[float, float]], free: Sequence[str]
+) -> dict[str, tuple[float, float]]:
+    """Boxes by coordinate name; a joint named without its side stands for both."""
+    out = {}
+    for name, box in table.items():
+        if f"L_{name}" in free:
+            out[f"L_{name}"], out[f"R_{name}"] = box, box
+        elif name in free or name in ("x", "y", "z", "pitch", "roll", "yaw"):
+            out[name] = box
+    return out
+
+
+def transcribe(
+    body: Body,
+    event: Event,
+    phases: Sequence[Phase],
+    config: Config,
+    *,
+    free: Sequence[str] = FREE,
+    pose: Mapping[str, float] | None = None,
+    position: Mapping[str, tuple[float, float]] | None = None,
+    held_limits: Sequence[str] = HELD_LIMITS,
+    tool: Sequence[Ball] = (),
+    bounds: Mapping[str, float] | None = None,
+    elastic: bool = False,
+) -> Transcription:
+    """The nonlinear program of a strike or throw; its parameters are the event's.
+
+    ``phases`` contain ``swing``, whose last knot is the event; ``pose`` are held angles (rad) and
+    ``position`` boxes that differ from :data:`POSITION`.
+    """
+    model = reduce_tree(load_tree(body), free, pose or {})
+    place = boxes({**POSITION, **(position or {})}, free)
+    place |= {"x": (-0.6, 0.6), "y": (-0.5, 0.5), "z": (0.6, 1.02)} | {
+        k: v for k, v in (position or {}).items() if k in "xyz"
+    }
+    program = Transcription(
+        body,
+        model,
+        phases,
+        Bounds(place, boxes(RATE, free), **{"hinge_rate": 35.0, "acceleration": 1000.0, **(bounds or {})}),
+        Weights(shear=SHEAR),
+        held_limits=held_limits,
+        parameters=PARAMETERS,
+        elastic=elastic,
+        standing=True,
+    )
+    at = int(program.knots("swing")[-1])
+    link = model.tree.link(event.link)
+
+    def strike(q, v, p):
+        motion = model.motion(q, v)
+        axis = motion.R_WL[link] @ ca.DM(list(event.axis))
+        return [
+            ("place", (motion.point(link, event.point) - p[:3]) / 0.1, 0.0, 0.0),
+            ("velocity", (motion.point_velocity(link, event.point) - p[3:6]) / 5.0, 0.0, 0.0),
+            ("direction", ca.vertcat(ca.dot(axis, p[9:12]), ca.dot(axis, p[12:15])), 0.0, 0.0),
+            ("facing", ca.dot(axis, p[6:9]), 0.5, np.inf),
+        ]
+
+    program.rows("event", [at], strike, rates=True)
+    rest(program)
+    everywhere = np.arange(program.K)
+    stance(program, body, (0.4, 0.75), 0.3)
+    arms_off(program, body, tool, everywhere)
+    wanted = {model.index(name): angle for name, angle in COMFORT.items() if name in model.names}
+    where, angles = list(wanted), ca.DM(list(wanted.values()))
+    program.cost(
+        "posture",
+        everywhere,
+        lambda q, v, p: PRICE / config.detail * ca.sumsqr(q[where] - angles),
+    )
+    return program
+
+
+def rest(program: Transcription, end_rate: float = 2.5) -> None:
+    """At rest at the first knot, nearly so at the last one, with the mass over the feet there."""
+    model = program.model
+    program.fix(program.v[0], 0.0)
+    program.bound(program.v[-1, 6:], -end_rate, end_rate)
+    program.bound(program.v[-1, :3], -0.3, 0.3)
+    program.bound(program.v[-1, 3:6], -1.0, 1.0)
+
+
+def stance(program: Transcription, body: Body, apart: tuple[float, float], ahead: float) -> None:
+    """The feet at the first knot: ``apart`` (m) across the body from right to left, neither more
+    than ``ahead`` (m) before the other; the athlete between them."""
+    model = program.model
+    ankles = [model.tree.link(f"{side}_Ankle") for side in "LR"]
+
+    def feet(q, p):
+        motion = model.motion(q)
+        left, right = (motion.p_WL[i] for i in ankles)
+        return [
+            ("feet apart", left[1] - right[1], *apart),
+            ("foot ahead", left[0] - right[0], -ahead, ahead),
+            ("between the feet", (left + right)[:2] / 2, -0.02, 0.02),
+        ]
+
+    program.rows("stance", [0], feet)
+
+
+def arms_off(program: Transcription, body: Body, tool: Sequence[Ball], knots) -> None:
+    """Arms and what they hold stay off trunk, head, thighs and each other; knees off each other."""
+    def end(link: str) -> Ball:
+        return axis_balls(body, link)[-1]
+
+    arms = {s: [*axis_balls(body, f"{s}_Elbow"), end(f"{s}_Hand")] for s in "LR"}
+    trunk = [end(link) for link in TRUNK]
+    thighs = [b for s in "LR" for b in axis_balls(body, f"{s}_Hip")]
+    pairs = [(a, b) for s in "LR" for a in arms[s][1:] for b in trunk]
+    pairs += [(a, b) for a in tool for b in trunk + thighs + arms["L"][1:]]
+    pairs += [(a, b) for a in arms["L"] for b in arms["R"]]
+    pairs += [(end(f"{s}_Shoulder"), end("Head")) for s in "LR"]
+    pairs += [(axis_balls(body, "L_Knee")[0], axis_balls(body, "R_Knee")[0])]
+    keep_off(program, pairs, knots)
+
+
+def keep_off(
+    program: Transcription, pairs: Sequence[tuple[Ball, Ball]], knots, margin: float = 0.0
+) -> None:
+    """The two balls of every pair stay ``margin`` (m) apart."""
+    model = program.model
+
+    def off(q, p):
+        motion = model.motion(q)
+
+        def at(ball: Ball):
+            return motion.point(model.tree.link(ball.link), ball.center)
+
+        gaps = [
+            ca.sumsqr(at(a) - at(b)) - (a.radius + b.radius + margin) ** 2 for a, b in pairs
+        ]
+        return [("apart", ca.vertcat(*gaps) / 0.05, 0.0, np.inf)]
+
+    program.rows("keep off", knots, off)
+
+
+def stand(model: ReducedModel, body: Body, bend: float = 0.25, width: float = 0.1) -> dict:
+    """A standing pose: knees bent by 2 ``bend`` (rad), hips spread by ``width`` (rad), soles flat
+    on the ground (root height z)."""
+    pose = {}
+    for side, sign in (("L", 1.0), ("R", -1.0)):
+        pose |= {
+            f"{side}_Hip_y": -bend,
+            f"{side}_Knee_y": 2 * bend,
+            f"{side}_Ankle_y": -bend,
+            f"{side}_Hip_x": sign * width,
+            f"{side}_Ankle_x": -sign * width,
+        }
+    frame = jumper.key_frames(model, [0.0, 1.0], [pose, pose], np.zeros(1))
+    q = ca.SX.sym("q", model.n)
+    heights = ca.Function(
+        "sole", [q], [ca.vertcat(*[
+            model.motion(q).point(model.tree.link(b.link), b.center)[2]
+            for b in jumper.foot(body, "L") if b.link.endswith("Toe")
+        ])]
+    )
+    pose["z"] = -float(np.array(heights(frame[0])).min())
+    return pose
+
+
+def solve(
+    name: str,
+    asked: dict[str, float],
+    event: Event,
+    transcribed: Callable[[bool], Transcription],
+    guessed: Callable[[Transcription], np.ndarray],
+    guess: Solution | None,
+    config: Config,
+    progress: Callable[[int, float], None] | None,
+    what: str,
+    where: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    **stats: object,
+) -> Solution:
+    """The least-effort motion with an event, put at ``where`` (x, y, yaw) of its sport.
+
+    ``transcribed(elastic)`` makes the program, ``guessed`` a first guess of it; ``guess`` is a
+    neighbour's solution. Raises Infeasible, saying ``what`` was asked for.
+    """
+
+    def attempt(elastic: bool) -> tuple[Transcription, Result]:
+        program = transcribed(elastic)
+        start = guessed(program) if guess is None else program.guess_from(unplaced(guess))
+        return program, jumper.run(
+            program, start, event.parameters(), guess is not None, progress, config.max_iterations
+        )
+
+    program, result = attempt(False)
+    jumper.check(result, what, lambda: attempt(True))
+    time = float(program.times(result.x)[program.knots("swing")[-1]])
+    solution = program.solution(
+        name, asked, result, event=event.at(time, *where), placed=list(where), **stats
+    )
+    return placed(solution, *where)
+
+
+def unplaced(solution: Solution) -> Solution:
+    """A solution in the athlete's own frame: undoes :func:`placed`."""
+    x, y, yaw = solution.stats.get("placed", (0.0, 0.0, 0.0))
+    c, s = np.cos(yaw), np.sin(yaw)
+    return placed(solution, -(c * x + s * y), s * x - c * y, -yaw)
+
+
+def placed(solution: Solution, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> Solution:
+    """The same motion turned by ``yaw`` (rad) about the world's z axis, then shifted (m)."""
+    turn = rotation.exp(np.array([0.0, 0.0, yaw]))
+    qpos, qvel, qacc = solution.qpos.copy(), solution.qvel.copy(), solution.qacc.copy()
+    qpos[:, :3] = rotation.rotate(turn, qpos[:, :3]) + np.array([x, y, 0.0])
+    qpos[:, 3:7] = rotation.multiply(np.broadcast_to(turn, (len(qpos), 4)), qpos[:, 3:7])
+    qvel[:, :3], qacc[:, :3] = rotation.rotate(turn, qvel[:, :3]), rotation.rotate(turn, qacc[:, :3])
+    force = rotation.rotate(turn, solution.contact_force)
+    return replace(solution, qpos=qpos, qvel=qvel, qacc=qacc, contact_force=force)
