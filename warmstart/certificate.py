@@ -27,12 +27,17 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from sports.humanoid.body import Body
 from sports.humanoid.mjcf import body_name, build_model
 from sports.physics.base import GRAVITY
 from sports.scene import humanoid_scene
 from warmstart import strike
 from warmstart.atomic import write_text
-from warmstart.inverse_dynamics import inverse_dynamics_drake, inverse_dynamics_mujoco
+from warmstart.inverse_dynamics import (
+    inverse_dynamics_drake,
+    inverse_dynamics_mujoco,
+    needed,
+)
 from warmstart.judged import RULES
 from warmstart.outcome import OUTCOMES, support
 from warmstart.replay import replay
@@ -280,17 +285,16 @@ def _interpolation(solution: Solution) -> dict[str, float]:
 
 def _dynamics(solution: Solution, notes: dict[str, str]) -> dict[str, float]:
     """Residual wrench on the root and servo torques needed, by both engines."""
-    motion = solution.sample(fine_times(solution))
     weight = solution.body.mass * GRAVITY
     effort = solution.body.array("effort")
-    needed = {
-        "mujoco": inverse_dynamics_mujoco(solution, motion),
-        "drake": inverse_dynamics_drake(solution, motion),
+    asked = {
+        "mujoco": needed(inverse_dynamics_mujoco, solution, fine_times(solution)),
+        "drake": needed(inverse_dynamics_drake, solution, fine_times(solution)),
     }
-    scale = max(float(np.abs(needed["mujoco"]).max()), weight)
-    difference = np.abs(needed["mujoco"] - needed["drake"]).max() / scale
+    scale = max(float(np.abs(asked["mujoco"]).max()), weight)
+    difference = np.abs(asked["mujoco"] - asked["drake"]).max() / scale
     out = {"inverse dynamics, mujoco against drake": float(difference)}
-    for engine, force in needed.items():
+    for engine, force in asked.items():
         share = np.abs(force[:, 6:]) / effort
         k, dof = np.unravel_index(int(np.argmax(share)), share.shape)
         name = f"needed torque, {engine}"
@@ -344,9 +348,30 @@ def _geometry(solution: Solution, notes: dict[str, str]) -> dict[str, float]:
     """Ground, self-contact and joint limits on the fine grid."""
     times = fine_times(solution)
     qpos = solution.sample(times)["qpos"]
-    points, radii = support(solution.body, qpos)
-    depth = float((radii - points[..., 2]).max())
-    model = build_model(solution.body)
+    holds = solution.loaded(times) > 0.0
+    depth, own = 0.0, 0.0
+    for body, rows in ((solution.body, holds), (solution.empty_handed, ~holds)):
+        if not rows.any():
+            continue
+        points, radii = support(body, qpos[rows])
+        depth = max(depth, float((radii - points[..., 2]).max()))
+        overlap, where = _overlap(body, times[rows], qpos[rows])
+        if overlap > own:
+            own, notes["depth of self-contact"] = overlap, where
+    hinges = qpos[:, 7:]
+    beyond = np.maximum(
+        hinges - solution.body.array("upper"), solution.body.array("lower") - hinges
+    )
+    return {
+        "depth below the ground": depth,
+        "depth of self-contact": own,
+        "beyond a joint limit": max(float(beyond.max()), 0.0),
+    }
+
+
+def _overlap(body: Body, times: np.ndarray, qpos: np.ndarray) -> tuple[float, str]:
+    """How far (m) two links of a body are inside each other at most, which, and when."""
+    model = build_model(body)
     data = mujoco.MjData(model)
     own, pair = 0.0, ""
     for t, row in enumerate(qpos):
@@ -358,16 +383,7 @@ def _geometry(solution: Solution, notes: dict[str, str]) -> dict[str, float]:
                 own = -float(contact.dist)
                 names = " and ".join(model.body(i).name.split("/")[-1] for i in (a, b))
                 pair = f"{names} at {times[t]:.3f} s"
-    notes["depth of self-contact"] = pair
-    hinges = qpos[:, 7:]
-    beyond = np.maximum(
-        hinges - solution.body.array("upper"), solution.body.array("lower") - hinges
-    )
-    return {
-        "depth below the ground": max(depth, 0.0),
-        "depth of self-contact": own,
-        "beyond a joint limit": max(float(beyond.max()), 0.0),
-    }
+    return own, pair
 
 
 def _touch_down(solution: Solution) -> dict[str, float]:

@@ -9,20 +9,43 @@ points by each engine's own kinematics. Their agreement is a figure of the certi
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import mujoco
 import numpy as np
 
+from sports.humanoid.body import Body
 from sports.humanoid.mjcf import body_name, build_model
 from warmstart.solution import Solution
 
 
-def inverse_dynamics_mujoco(solution: Solution, motion: dict[str, np.ndarray]) -> np.ndarray:
+def needed(
+    compute: Callable[[Solution, dict[str, np.ndarray], Body], np.ndarray],
+    solution: Solution,
+    times: np.ndarray,
+) -> np.ndarray:
+    """(T, nv) forces that a solution needs at times (T,) s, by one of the functions below.
+
+    While a hand opens, the share of the payload that it still holds counts: inverse dynamics is
+    linear in the masses.
+    """
+    motion, share = solution.sample(times), solution.loaded(times)
+    out = compute(solution, motion, solution.body)
+    if share.min() < 1.0:
+        empty = compute(solution, motion, solution.empty_handed)
+        out = share[:, None] * out + (1.0 - share[:, None]) * empty
+    return out
+
+
+def inverse_dynamics_mujoco(
+    solution: Solution, motion: dict[str, np.ndarray], body: Body | None = None
+) -> np.ndarray:
     """(T, nv) forces needed besides gravity, damping and contact, by MuJoCo.
 
     The first three act on the root in world axes (N), the next three are the moment about its
     origin in the root's axes (N m); both are zero for a true motion. The rest are servo torques.
     """
-    model = build_model(solution.body)
+    model = build_model(body or solution.body)
     model.opt.disableflags |= int(
         mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
     )
@@ -41,14 +64,16 @@ def inverse_dynamics_mujoco(solution: Solution, motion: dict[str, np.ndarray]) -
     return out
 
 
-def inverse_dynamics_drake(solution: Solution, motion: dict[str, np.ndarray]) -> np.ndarray:
+def inverse_dynamics_drake(
+    solution: Solution, motion: dict[str, np.ndarray], body: Body | None = None
+) -> np.ndarray:
     """(T, nv) the same as :func:`inverse_dynamics_mujoco`, by Drake, in MuJoCo's coordinates."""
     from pydrake.multibody.math import SpatialForce
     from pydrake.multibody.tree import MultibodyForces
 
     from sports.humanoid.drake_plant import build_plant, rotate
 
-    built = build_plant(solution.body, time_step=0.0, ground=False)
+    built = build_plant(body or solution.body, time_step=0.0, ground=False)
     plant, human = built.plant, built.humanoid
     context = plant.CreateDefaultContext()
     world = plant.world_frame()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from sports import tennis
-from warmstart import shot
+from warmstart import shot, thrown
 from warmstart.solution import Solution
 from warmstart.strike import Moment, Rules
 
@@ -18,6 +20,19 @@ def _tennis_played(solution: Solution, engine: str) -> dict[str, float]:
     return shot.played(tennis.GAME, scene, solution, engine)
 
 
+def _javelin(solution: Solution, found: Moment) -> dict[str, float]:
+    return {
+        "outcome": float(np.linalg.norm(found.velocity)),
+        "height": float(found.place[2]),
+        "distance": thrown.distance(found.place, found.velocity, found.normal),
+    }
+
+
+_THROWN: dict[str, tuple[str, float, str]] = {
+    f"{head}{name}": ("recorded", float("nan"), "m")
+    for head in ("planned ", "replay in mujoco: ", "replay in drake: ")
+    for name in ("height", "distance")
+}
 _BALL: dict[str, tuple[str, float, str]] = {
     "planned landing off target": ("<=", 0.5, "m"),
     "planned over the net": (">=", 0.0, "m"),
@@ -35,6 +50,7 @@ _BALL: dict[str, tuple[str, float, str]] = {
 }
 
 RULES: dict[str, Rules] = {
+    "javelin": Rules("release_speed", "m/s", False, _javelin, None, _THROWN),
     "tennis": Rules("ball_speed", "m/s", True, _tennis, _tennis_played, _BALL),
 }
 """By problem."""

@@ -27,6 +27,10 @@ class Phase:
     """Contact mode by side, e.g. ``{"L": "flat"}``; modes: ``flat``, ``toe``."""
     grading: float = 1.0
     """Length of the later intervals over the first: small steps where motion is abrupt."""
+    loaded: bool = True
+    """Whether what the athlete holds is still in its hand."""
+    abrupt: bool = False
+    """A moment in which torques, forces and accelerations may change at no cost: a hand opens."""
 
     def spacing(self) -> np.ndarray:
         """(intervals,) lengths relative to their mean: growing over the first third, then equal."""

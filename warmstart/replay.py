@@ -51,30 +51,46 @@ def replay_states(
     theirs follow the athlete's in what is returned.
     """
     scene = scene or humanoid_scene(solution.body)
-    scene = replace(scene, timestep=1.0 / REPLAY_RATE, substeps=1)
-    things = objects or (np.zeros(0), np.zeros(0))
-    physics = make_physics(engine, scene, 1)
     planned = math.floor(solution.duration * REPLAY_RATE)
     steps = planned + round(hold * REPLAY_RATE)
     middle = np.minimum((np.arange(steps) + 0.5) / REPLAY_RATE, solution.duration)
     motion = solution.sample(solution.times[0] + middle)
     targets = motion["qpos"][:, 7:] + motion["torque"] / solution.body.array("kp")
+    things = objects or (np.zeros(0), np.zeros(0))
+    qpos = [np.concatenate([solution.qpos[0], things[0]])]
+    qvel = [np.concatenate([solution.qvel[0], things[1]])]
+    held = int((solution.loaded(middle) > 0.5).sum())
+    _play(engine, scene, targets[:held], qpos, qvel)
+    if held < steps:  # what was thrown is no longer in the hand
+        _play(engine, replace(scene, body=solution.empty_handed), targets[held:], qpos, qvel)
+    return np.arange(len(qpos)) / REPLAY_RATE, np.array(qpos), np.array(qvel)
+
+
+def _play(
+    engine: str,
+    scene: Scene,
+    targets: np.ndarray,
+    qpos: list[np.ndarray],
+    qvel: list[np.ndarray],
+) -> None:
+    """Appends what an engine makes of the targets (T, n) from the last state in the lists."""
+    scene = replace(scene, timestep=1.0 / REPLAY_RATE, substeps=1)
+    physics = make_physics(engine, scene, 1)
     state = PhysicsState(
-        torch.tensor(np.concatenate([solution.qpos[0], things[0]])[None], dtype=torch.float32),
-        torch.tensor(np.concatenate([solution.qvel[0], things[1]])[None], dtype=torch.float32),
+        torch.tensor(qpos[-1][None], dtype=torch.float32),
+        torch.tensor(qvel[-1][None], dtype=torch.float32),
         torch.zeros(1, 0, 3),
     )
     physics.reset(torch.ones(1, dtype=torch.bool), state)
-    out = [physics.qpos[0].double().numpy().copy()]
-    rates = [physics.qvel[0].double().numpy().copy()]
+    qpos[-1] = physics.qpos[0].double().numpy().copy()
+    qvel[-1] = physics.qvel[0].double().numpy().copy()
     for target in targets:
         physics.step(torch.tensor(target[None], dtype=torch.float32))
         if bool(physics.bad.any()):
-            raise RuntimeError(f"the replay diverged in {engine} after {len(out)} steps")
-        out.append(physics.qpos[0].double().numpy().copy())
-        rates.append(physics.qvel[0].double().numpy().copy())
+            raise RuntimeError(f"the replay diverged in {engine} after {len(qpos)} steps")
+        qpos.append(physics.qpos[0].double().numpy().copy())
+        qvel.append(physics.qvel[0].double().numpy().copy())
     physics.close()
-    return np.arange(len(out)) / REPLAY_RATE, np.array(out), np.array(rates)
 
 
 def scene_options(clip: Clip) -> dict[str, Any]:

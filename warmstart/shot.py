@@ -84,8 +84,9 @@ def until(law: str, ball: Ball, axis: int, value: float) -> Ball | None:
         if p[axis] != value:
             side = p[axis] > value
         if side is not None and (q[axis] > value) != side:
-            return _refined(law, Ball(begun + k * STEP, np.array(p), np.array(v), ball.angvel),
-                            axis, value)
+            return _refined(
+                law, Ball(begun + k * STEP, np.array(p), np.array(v), ball.angvel), axis, value
+            )
         p, v = q, u
     return None
 
@@ -318,7 +319,9 @@ def played(game: Game, scene: Scene, solution: Solution, engine: str) -> dict[st
     if not after.size:
         return {"ball: speed": 0.0, "ball: landing off target": LOST, "ball: over the net": -LOST}
     k = min(after[0] + 1, len(where) - 1)  # the step of the impact has ended
-    struck = Ball(0.0, where[k, at : at + 3], rates[k, spin : spin + 3], _spin(where[k], rates[k], at, spin))
+    struck = Ball(
+        0.0, where[k, at : at + 3], rates[k, spin : spin + 3], _spin(where[k], rates[k], at, spin)
+    )
     found = _judged(game, solution, struck)
     return {f"ball: {'speed' if n == 'outcome' else n}": value for n, value in found.items()}
 

@@ -87,6 +87,29 @@ class Solution:
         """Seconds from the first to the last knot."""
         return float(self.times[-1] - self.times[0])
 
+    def loaded(self, times: np.ndarray) -> np.ndarray:
+        """(T,) share of what is thrown that is in the hand: 1, then 0; 1 for ever without a throw.
+
+        ``stats["payload"]`` = ``{"equipment", "held", "gone"}``: the name of what is thrown, and
+        the times (s) between which the hand opens.
+        """
+        payload = self.stats.get("payload")
+        if payload is None:
+            return np.ones(len(times))
+        held, gone = payload["held"], payload["gone"]
+        return np.clip((gone - np.asarray(times)) / (gone - held), 0.0, 1.0)
+
+    @property
+    def empty_handed(self) -> Body:
+        """The athlete without what it throws."""
+        thrown = self.stats.get("payload", {}).get("equipment")
+        return load_body(
+            self.body.name,
+            strength=self.body.strength,
+            limits=self.body.limits,
+            equipment=[name for name in self.body.equipment if name != thrown],
+        )
+
     def sample(self, times: np.ndarray) -> dict[str, np.ndarray]:
         """The motion at any times (T,) s inside ``[times[0], times[-1]]``.
 

@@ -43,8 +43,10 @@ class Transcription:
         parameters: int = 0,
         elastic: bool = False,
         standing: bool = False,
+        unloaded: ReducedModel | None = None,
     ) -> None:
         self.standing = standing
+        self.unloaded = unloaded or model
         self.body, self.model, self.phases = body, model, tuple(phases)
         self.bounds, self.weights = bounds, weights or Weights()
         self.held_limits, self.flight_limits = tuple(held_limits), tuple(flight_limits)
@@ -94,6 +96,11 @@ class Transcription:
             else:
                 runs.append((first, last))
         return runs
+
+    def model_at(self, knot: int) -> ReducedModel:
+        """The athlete at a knot: with what it holds where all phases there are loaded."""
+        here = [p for i, p in enumerate(self.phases) if self.ends[i] <= knot <= self.ends[i + 1]]
+        return self.model if all(p.loaded for p in here) else self.unloaded
 
     def interval_phase(self) -> np.ndarray:
         """(K-1,) phase of each interval."""
@@ -192,21 +199,21 @@ class Transcription:
     def _add_dynamics(self) -> None:
         """Root wrench zero, joint torque = u - kd v, friction cones; limits of held joints
         where they matter (more of them in stance than in flight)."""
-        model = self.model
-        tree = model.tree
-        damping = ca.DM(tree.damping[model.free_index])
+        tree = self.model.tree
+        damping = ca.DM(tree.damping[self.model.free_index])
         effort = ca.DM(self.effort)
-        groups: dict[tuple[str, ...], list[int]] = {}
+        groups: dict[tuple[tuple[str, ...], bool], list[int]] = {}
         for k in range(self.K):
-            key = tuple(side for side in self.sides if k in self.f[side])
-            groups.setdefault(key, []).append(k)
-        for sides, knots in groups.items():
+            sides = tuple(side for side in self.sides if k in self.f[side])
+            groups.setdefault((sides, self.model_at(k) is self.model), []).append(k)
+        for (sides, loaded), knots in groups.items():
+            model = self.model if loaded else self.unloaded
             points = [point for side in sides for point in sole_points(self.body, side)]
 
             limited = self.held_limits if points else self.flight_limits
             held = [tree.dofs.index(d) for d in limited if d not in model.free]
 
-            def build(q, v, a, u, *rest, points=points, held=held):
+            def build(q, v, a, u, *rest, points=points, held=held, model=model):
                 forces, rows = [], []
                 if points:
                     f = ca.reshape(rest[0], 3, len(points))
@@ -251,15 +258,17 @@ class Transcription:
             )
             rate = w.torque_rate * ca.sumsqr((u1 - u0) / effort)
             rate += w.acceleration_rate * ca.sumsqr((a1 - a0)[6:] / 50)
-            return h / 2 * running + rate / h, rows
+            return h / 2 * running + p[-2] * rate / h, rows
 
         k = np.arange(self.K - 1)
         h = self.h[self.interval_phase()][:, None]
         inputs = [x[k + i] for i in (0, 1) for x in (self.q, self.v, self.a, self.u)]
         spacing = self.spacing()[:, None]
-        self.program.block("interval", [*inputs, h], build, spacing)
+        steady = np.array([not self.phases[i].abrupt for i in self.interval_phase()])
+        data = np.hstack([steady[:, None].astype(float), spacing])
+        self.program.block("interval", [*inputs, h], build, data)
         for side in self.sides:
-            pairs = [k for k in self.f[side] if k + 1 in self.f[side]]
+            pairs = [k for k in self.f[side] if k + 1 in self.f[side] and steady[k]]
 
             def force_rate(f0, f1, h, p):
                 cost = w.force_rate * ca.sumsqr((f1 - f0) / self.weight) / (h * p[-1])
@@ -457,10 +466,14 @@ class Transcription:
         q, v, a = (ca.SX.sym(name, model.n) for name in "qva")
         f = ca.SX.sym("f", 3, len(points))
         forces = [(model.tree.link(link), p, f[:, i]) for i, (link, p) in enumerate(points)]
-        tau = ca.Function("tau", [q, v, a, f], [model.inverse_dynamics(q, v, a, forces)])
+        functions = [
+            ca.Function("tau", [q, v, a, f], [m.inverse_dynamics(q, v, a, forces)])
+            for m in (self.model, self.unloaded)
+        ]
         force = self.forces(x)
         torque = np.zeros((self.K, model.tree.num_dofs))
         for k in range(self.K):
+            tau = functions[self.model_at(k) is not self.model]
             out = np.array(tau(x[self.q[k]], x[self.v[k]], x[self.a[k]], force[k].T)).ravel()
             torque[k] = out[6:]
         torque[:, model.free_index] += model.tree.damping[model.free_index] * x[self.v[:, 6:]]

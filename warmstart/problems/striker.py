@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,9 +20,10 @@ from sports.humanoid.body import Body, Strength
 from warmstart import rotation
 from warmstart.contact import Ball
 from warmstart.nlp import Result
+from warmstart.outcome import link_poses
 from warmstart.phases import Bounds, Phase, Weights
 from warmstart.problems import jumper
-from warmstart.rigid_body import ReducedModel, center_of_mass, load_tree, reduce_tree
+from warmstart.rigid_body import ReducedModel, load_tree, reduce_tree
 from warmstart.separation import axis_balls
 from warmstart.solution import Solution
 from warmstart.transcription import Transcription
@@ -85,17 +87,22 @@ RATE = {
 """Rate boxes of the root (m/s, rad/s)."""
 
 
+SHARE = 0.93
+"""Share of a torque limit that a stroke may use at knots: it is used at its peak for one knot, and
+more between two."""
 SHEAR = 30.0
 """Weight of the horizontal force on each foot."""
 TRUNK = ("Pelvis", "Torso", "Chest", "Head")
 COMFORT = {
-    **{name: 0.0 for name in ("pitch", "roll", "Torso_x", "Torso_y", "Chest_y")},
+    **dict.fromkeys(("pitch", "roll", "Torso_x", "Torso_y", "Chest_y"), 0.0),
     **{f"{side}_Hip_{axis}": 0.0 for side in "LR" for axis in "xz"},
     "L_Shoulder_x": -1.1,
     "L_Shoulder_z": -0.5,
     "L_Elbow_z": -1.0,
 }
 """Angles (rad) to which a small price draws the posture: upright, and an idle arm at rest."""
+TOOL_ROOM = 0.04
+"""What is held keeps this far (m) off the body at knots: it moves 0.4 m between two of them."""
 PRICE = 4e-3
 """Cost of a squared radian off :data:`COMFORT` at one knot."""
 
@@ -133,6 +140,10 @@ class Event:
     place: tuple[float, float, float]
     velocity: tuple[float, float, float]
     normal: tuple[float, float, float]
+    fixed: tuple[int, ...] = (0, 1, 2)
+    """Coordinates of ``place`` that are prescribed; the others are the optimiser's."""
+    spin: float = np.inf
+    """Largest component of the link's angular velocity (rad/s)."""
 
     def parameters(self) -> list[float]:
         """The program's parameters: place, velocity, normal and two directions across it."""
@@ -142,7 +153,7 @@ class Event:
         rows = (self.place, self.velocity, n, across, np.cross(n, across))
         return [float(x) for row in rows for x in row]
 
-    def at(self, time: float, x: float, y: float, yaw: float) -> dict[str, object]:
+    def at(self, time: float, x: float, y: float, yaw: float) -> dict[str, Any]:
         """The event in a solution's stats: at its time, in the world where :func:`placed` puts it."""
         turn = rotation.exp(np.array([0.0, 0.0, yaw]))
         place, velocity, normal = (
@@ -186,13 +197,17 @@ def transcribe(
     position: Mapping[str, tuple[float, float]] | None = None,
     held_limits: Sequence[str] = HELD_LIMITS,
     tool: Sequence[Ball] = (),
+    unloaded: Body | None = None,
+    feet: tuple[tuple[float, float], tuple[float, float]] = ((0.4, 0.75), (-0.3, 0.3)),
     bounds: Mapping[str, float] | None = None,
     elastic: bool = False,
 ) -> Transcription:
     """The nonlinear program of a strike or throw; its parameters are the event's.
 
     ``phases`` contain ``swing``, whose last knot is the event; ``pose`` are held angles (rad) and
-    ``position`` boxes that differ from :data:`POSITION`.
+    ``position`` boxes that differ from :data:`POSITION`; ``tool`` are balls around what is held,
+    ``unloaded`` is the body in phases without it; ``feet``: how far the left foot stands to the
+    left of and ahead of the right one (m).
     """
     model = reduce_tree(load_tree(body), free, pose or {})
     place = boxes({**POSITION, **(position or {})}, free)
@@ -203,12 +218,17 @@ def transcribe(
         body,
         model,
         phases,
-        Bounds(place, boxes(RATE, free), **{"hinge_rate": 35.0, "acceleration": 1000.0, **(bounds or {})}),
+        Bounds(
+            place,
+            boxes(RATE, free),
+            **{"hinge_rate": 35.0, "acceleration": 1000.0, "torque_share": SHARE, **(bounds or {})},
+        ),
         Weights(shear=SHEAR),
         held_limits=held_limits,
         parameters=PARAMETERS,
         elastic=elastic,
         standing=True,
+        unloaded=reduce_tree(load_tree(unloaded), free, pose or {}) if unloaded else None,
     )
     at = int(program.knots("swing")[-1])
     link = model.tree.link(event.link)
@@ -216,8 +236,11 @@ def transcribe(
     def strike(q, v, p):
         motion = model.motion(q, v)
         axis = motion.R_WL[link] @ ca.DM(list(event.axis))
+        off = motion.point(link, event.point) - p[:3]
+        rows = [] if event.spin == np.inf else [("spin", motion.w[link], -event.spin, event.spin)]
         return [
-            ("place", (motion.point(link, event.point) - p[:3]) / 0.1, 0.0, 0.0),
+            *rows,
+            ("place", off[list(event.fixed)] / 0.1, 0.0, 0.0),
             ("velocity", (motion.point_velocity(link, event.point) - p[3:6]) / 5.0, 0.0, 0.0),
             ("direction", ca.vertcat(ca.dot(axis, p[9:12]), ca.dot(axis, p[12:15])), 0.0, 0.0),
             ("facing", ca.dot(axis, p[6:9]), 0.5, np.inf),
@@ -226,8 +249,11 @@ def transcribe(
     program.rows("event", [at], strike, rates=True)
     rest(program)
     everywhere = np.arange(program.K)
-    stance(program, body, (0.4, 0.75), 0.3)
-    arms_off(program, body, tool, everywhere)
+    stance(program, body, *feet)
+    arms_off(program, body, everywhere)
+    loaded = np.array([k for k in everywhere if program.model_at(k) is model])
+    if tool:
+        tool_off(program, body, tool, loaded)
     wanted = {model.index(name): angle for name, angle in COMFORT.items() if name in model.names}
     where, angles = list(wanted), ca.DM(list(wanted.values()))
     program.cost(
@@ -240,16 +266,17 @@ def transcribe(
 
 def rest(program: Transcription, end_rate: float = 2.5) -> None:
     """At rest at the first knot, nearly so at the last one, with the mass over the feet there."""
-    model = program.model
     program.fix(program.v[0], 0.0)
     program.bound(program.v[-1, 6:], -end_rate, end_rate)
     program.bound(program.v[-1, :3], -0.3, 0.3)
     program.bound(program.v[-1, 3:6], -1.0, 1.0)
 
 
-def stance(program: Transcription, body: Body, apart: tuple[float, float], ahead: float) -> None:
-    """The feet at the first knot: ``apart`` (m) across the body from right to left, neither more
-    than ``ahead`` (m) before the other; the athlete between them."""
+def stance(
+    program: Transcription, body: Body, apart: tuple[float, float], ahead: tuple[float, float]
+) -> None:
+    """The feet at the first knot: the left one ``apart`` (m) to the left of and ``ahead`` (m) of
+    the right one; the athlete between them."""
     model = program.model
     ankles = [model.tree.link(f"{side}_Ankle") for side in "LR"]
 
@@ -258,25 +285,64 @@ def stance(program: Transcription, body: Body, apart: tuple[float, float], ahead
         left, right = (motion.p_WL[i] for i in ankles)
         return [
             ("feet apart", left[1] - right[1], *apart),
-            ("foot ahead", left[0] - right[0], -ahead, ahead),
+            ("foot ahead", left[0] - right[0], *ahead),
             ("between the feet", (left + right)[:2] / 2, -0.02, 0.02),
         ]
 
     program.rows("stance", [0], feet)
 
 
-def arms_off(program: Transcription, body: Body, tool: Sequence[Ball], knots) -> None:
-    """Arms and what they hold stay off trunk, head, thighs and each other; knees off each other."""
-    def end(link: str) -> Ball:
-        return axis_balls(body, link)[-1]
+def _end(body: Body, link: str) -> Ball:
+    return axis_balls(body, link)[-1]
 
-    arms = {s: [*axis_balls(body, f"{s}_Elbow"), end(f"{s}_Hand")] for s in "LR"}
-    trunk = [end(link) for link in TRUNK]
-    thighs = [b for s in "LR" for b in axis_balls(body, f"{s}_Hip")]
+
+def _forearm(body: Body, side: str) -> list[Ball]:
+    return [*axis_balls(body, f"{side}_Elbow"), _end(body, f"{side}_Hand")]
+
+
+def obstacles(body: Body) -> list[Ball]:
+    """What a thing in the right hand can meet: trunk, head, upper arms, left arm, thighs."""
+    return [
+        *(_end(body, link) for link in TRUNK),
+        *_forearm(body, "L")[1:],
+        *(b for s in "LR" for b in axis_balls(body, f"{s}_Hip", 3)),
+        *(b for s in "LR" for b in axis_balls(body, f"{s}_Shoulder", 3)[1:]),
+    ]
+
+
+def tool_off(program: Transcription, body: Body, tool: Sequence[Ball], knots) -> None:
+    """What is held, as balls, stays off the body."""
+    keep_off(program, [(a, b) for a in tool for b in obstacles(body)], knots, TOOL_ROOM)
+
+
+def shaft_off(
+    program: Transcription, body: Body, event: Event, radius: float, knots, room: float = TOOL_ROOM
+) -> None:
+    """A long shaft of a ``radius`` (m), along the event's axis through its point, stays off the
+    body: the distance of balls from a line."""
+    model = program.model
+    link = model.tree.link(event.link)
+
+    def off(q, p):
+        motion = model.motion(q)
+        along = motion.R_WL[link] @ ca.DM(list(event.axis))
+        through = motion.point(link, event.point)
+        gaps = []
+        for b in obstacles(body):
+            to = motion.point(model.tree.link(b.link), b.center) - through
+            gaps.append(ca.sumsqr(to) - ca.dot(to, along) ** 2 - (b.radius + radius + room) ** 2)
+        return [("shaft apart", ca.vertcat(*gaps) / 0.05, 0.0, np.inf)]
+
+    program.rows("shaft off", knots, off)
+
+
+def arms_off(program: Transcription, body: Body, knots) -> None:
+    """Arms stay off trunk, head and each other; knees off each other."""
+    arms = {s: _forearm(body, s) for s in "LR"}
+    trunk = [_end(body, link) for link in TRUNK]
     pairs = [(a, b) for s in "LR" for a in arms[s][1:] for b in trunk]
-    pairs += [(a, b) for a in tool for b in trunk + thighs + arms["L"][1:]]
     pairs += [(a, b) for a in arms["L"] for b in arms["R"]]
-    pairs += [(end(f"{s}_Shoulder"), end("Head")) for s in "LR"]
+    pairs += [(_end(body, f"{s}_Shoulder"), _end(body, "Head")) for s in "LR"]
     pairs += [(axis_balls(body, "L_Knee")[0], axis_balls(body, "R_Knee")[0])]
     keep_off(program, pairs, knots)
 
@@ -293,9 +359,7 @@ def keep_off(
         def at(ball: Ball):
             return motion.point(model.tree.link(ball.link), ball.center)
 
-        gaps = [
-            ca.sumsqr(at(a) - at(b)) - (a.radius + b.radius + margin) ** 2 for a, b in pairs
-        ]
+        gaps = [ca.sumsqr(at(a) - at(b)) - (a.radius + b.radius + margin) ** 2 for a, b in pairs]
         return [("apart", ca.vertcat(*gaps) / 0.05, 0.0, np.inf)]
 
     program.rows("keep off", knots, off)
@@ -316,10 +380,17 @@ def stand(model: ReducedModel, body: Body, bend: float = 0.25, width: float = 0.
     frame = jumper.key_frames(model, [0.0, 1.0], [pose, pose], np.zeros(1))
     q = ca.SX.sym("q", model.n)
     heights = ca.Function(
-        "sole", [q], [ca.vertcat(*[
-            model.motion(q).point(model.tree.link(b.link), b.center)[2]
-            for b in jumper.foot(body, "L") if b.link.endswith("Toe")
-        ])]
+        "sole",
+        [q],
+        [
+            ca.vertcat(
+                *[
+                    model.motion(q).point(model.tree.link(b.link), b.center)[2]
+                    for b in jumper.foot(body, "L")
+                    if b.link.endswith("Toe")
+                ]
+            )
+        ],
     )
     pose["z"] = -float(np.array(heights(frame[0])).min())
     return pose
@@ -336,12 +407,14 @@ def solve(
     progress: Callable[[int, float], None] | None,
     what: str,
     where: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    thrown: tuple[str, float] | None = None,
     **stats: object,
 ) -> Solution:
     """The least-effort motion with an event, put at ``where`` (x, y, yaw) of its sport.
 
     ``transcribed(elastic)`` makes the program, ``guessed`` a first guess of it; ``guess`` is a
-    neighbour's solution. Raises Infeasible, saying ``what`` was asked for.
+    neighbour's solution; ``thrown`` names what leaves the hand, and in which time (s). Raises
+    Infeasible, saying ``what`` was asked for.
     """
 
     def attempt(elastic: bool) -> tuple[Transcription, Result]:
@@ -354,10 +427,24 @@ def solve(
     program, result = attempt(False)
     jumper.check(result, what, lambda: attempt(True))
     time = float(program.times(result.x)[program.knots("swing")[-1]])
-    solution = program.solution(
-        name, asked, result, event=event.at(time, *where), placed=list(where), **stats
-    )
-    return placed(solution, *where)
+    if thrown is not None:
+        stats["payload"] = {"equipment": thrown[0], "held": time, "gone": time + thrown[1]}
+    solution = program.solution(name, asked, result, placed=list(where), **stats)
+    at = event.at(time, *where)
+    free = [i for i in range(3) if i not in event.fixed]
+    solution = placed(solution, *where)
+    if free:  # where the optimiser put it
+        here = place_of(solution, at)
+        at["place"] = [float(here[i]) if i in free else at["place"][i] for i in range(3)]
+    return replace(solution, stats=solution.stats | {"event": at})
+
+
+def place_of(solution: Solution, event: dict[str, Any]) -> np.ndarray:
+    """(3,) where the event's point is at its time (m)."""
+    qpos = solution.sample(np.array([event["time"]]))["qpos"]
+    pos, quat = link_poses(solution.body, qpos)
+    link = solution.body.link_index(event["link"])
+    return pos[0, link] + rotation.rotate(quat[0, link], np.array(event["point"]))
 
 
 def unplaced(solution: Solution) -> Solution:
@@ -373,6 +460,9 @@ def placed(solution: Solution, x: float = 0.0, y: float = 0.0, yaw: float = 0.0)
     qpos, qvel, qacc = solution.qpos.copy(), solution.qvel.copy(), solution.qacc.copy()
     qpos[:, :3] = rotation.rotate(turn, qpos[:, :3]) + np.array([x, y, 0.0])
     qpos[:, 3:7] = rotation.multiply(np.broadcast_to(turn, (len(qpos), 4)), qpos[:, 3:7])
-    qvel[:, :3], qacc[:, :3] = rotation.rotate(turn, qvel[:, :3]), rotation.rotate(turn, qacc[:, :3])
+    qvel[:, :3], qacc[:, :3] = (
+        rotation.rotate(turn, qvel[:, :3]),
+        rotation.rotate(turn, qacc[:, :3]),
+    )
     force = rotation.rotate(turn, solution.contact_force)
     return replace(solution, qpos=qpos, qvel=qvel, qacc=qacc, contact_force=force)

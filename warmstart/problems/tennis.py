@@ -30,12 +30,15 @@ from warmstart.transcription import Transcription
 GAME = tennis.GAME
 MEET_X = 12.5
 """The ball is met when it comes to this plane (m): half a metre before the task's start."""
-BEFORE = {"forehand": (0.45, -0.75), "backhand": (0.55, 0.40)}
+BEFORE = {"forehand": (0.45, -0.75), "backhand": (0.62, 0.40)}
 """Where the ball is met, ahead of and to the left of the middle between the feet (m)."""
 FACE = {"forehand": -1.0, "backhand": 1.0}
 """Which side of the racket hits: along the wrist's z, the back of the hand."""
-RACKET = Ball("R_Wrist", (0.0, -tennis.RACKET_REACH, 0.0), tennis.RACKET_RADIUS)
-"""A ball around the racket's head, for clearances."""
+RACKET = (
+    Ball("R_Wrist", (0.0, -tennis.RACKET_REACH, 0.0), tennis.RACKET_RADIUS),
+    Ball("R_Wrist", (0.0, -0.14, 0.0), 0.03),
+)
+"""Balls around the racket's head and handle, for clearances."""
 YAW = math.pi
 FEET = {"L": "flat", "R": "flat"}
 SWING, FOLLOW = (0.40, 0.75), (0.30, 0.50)
@@ -135,7 +138,7 @@ def transcribe(
     phases = [Phase("swing", knots(32), SWING, FEET), Phase("follow", knots(15), FOLLOW, FEET)]
     position = {} if config.side == "forehand" else BACKHAND_POSITION
     program = striker.transcribe(
-        body, event, phases, config, position=position, tool=[RACKET], elastic=elastic
+        body, event, phases, config, position=position, tool=RACKET, elastic=elastic
     )
     ready = READY[config.side]
     for name, (low, high) in ready.items():
@@ -187,19 +190,110 @@ def _pose(x: float, yaw: float, twist: float, arm, elbow, wrist, left) -> dict[s
 
 KEYS = {
     "forehand": (
-        (0.0, _pose(0.06, -0.3, -1.1, (1.2, -0.5, -0.4), (-0.75, 0.5), (-0.5, 0.7, -0.7), (-0.9, -0.7, -0.6))),
-        (0.37, _pose(0.06, -0.25, -0.8, (1.3, -0.55, -0.7), (-0.75, 0.3), (-0.5, 0.6, -0.7), (-0.95, -0.7, -0.3))),
-        (0.75, _pose(0.09, -0.03, -0.2, (1.4, -0.7, -0.8), (-0.8, 0.15), (-0.55, 0.2, -0.7), (-1.05, -0.65, -0.2))),
-        (0.90, _pose(0.11, 0.07, 0.3, (1.2, -0.85, -0.5), (-0.8, 0.4), (-0.5, -0.3, -0.7), (-1.05, -0.6, -0.2))),
-        (1.0, _pose(0.11, 0.1, 0.55, (0.7, -0.9, 0.15), (-0.75, 0.8), (-0.35, -0.75, -0.55), (-1.05, -0.6, -0.2))),
-        (1.3, _pose(0.13, 0.13, 0.9, (-0.2, -0.8, 1.1), (-0.45, 1.15), (0.05, -1.1, -0.25), (-1.05, -0.6, -0.3))),
-        (2.0, _pose(0.15, 0.2, 1.1, (-0.4, -0.65, 1.4), (-0.25, 1.1), (0.2, -1.1, -0.2), (-1.05, -0.65, -0.3))),
+        (
+            0.0,
+            _pose(
+                0.06,
+                -0.3,
+                -1.1,
+                (1.2, -0.5, -0.4),
+                (-0.75, 0.5),
+                (-0.5, 0.7, -0.7),
+                (-0.9, -0.7, -0.6),
+            ),
+        ),
+        (
+            0.37,
+            _pose(
+                0.06,
+                -0.25,
+                -0.8,
+                (1.3, -0.55, -0.7),
+                (-0.75, 0.3),
+                (-0.5, 0.6, -0.7),
+                (-0.95, -0.7, -0.3),
+            ),
+        ),
+        (
+            0.75,
+            _pose(
+                0.09,
+                -0.03,
+                -0.2,
+                (1.4, -0.7, -0.8),
+                (-0.8, 0.15),
+                (-0.55, 0.2, -0.7),
+                (-1.05, -0.65, -0.2),
+            ),
+        ),
+        (
+            0.90,
+            _pose(
+                0.11,
+                0.07,
+                0.3,
+                (1.2, -0.85, -0.5),
+                (-0.8, 0.4),
+                (-0.5, -0.3, -0.7),
+                (-1.05, -0.6, -0.2),
+            ),
+        ),
+        (
+            1.0,
+            _pose(
+                0.11,
+                0.1,
+                0.55,
+                (0.7, -0.9, 0.15),
+                (-0.75, 0.8),
+                (-0.35, -0.75, -0.55),
+                (-1.05, -0.6, -0.2),
+            ),
+        ),
+        (
+            1.3,
+            _pose(
+                0.13,
+                0.13,
+                0.9,
+                (-0.2, -0.8, 1.1),
+                (-0.45, 1.15),
+                (0.05, -1.1, -0.25),
+                (-1.05, -0.6, -0.3),
+            ),
+        ),
+        (
+            2.0,
+            _pose(
+                0.15,
+                0.2,
+                1.1,
+                (-0.4, -0.65, 1.4),
+                (-0.25, 1.1),
+                (0.2, -1.1, -0.2),
+                (-1.05, -0.65, -0.3),
+            ),
+        ),
     ),
     "backhand": (
-        (0.0, _pose(0.05, 0.3, 0.9, (1.2, 0.0, 1.2), (0.0, 1.0), (0.0, 0.0, 0.0), (-1.2, 0.0, -0.3))),
-        (0.6, _pose(0.05, 0.3, 1.0, (1.1, 0.0, 1.5), (0.0, 1.0), (0.0, 0.0, 0.3), (-1.2, 0.0, -0.3))),
-        (1.0, _pose(0.1, 0.0, 0.2, (0.8, 0.0, 0.9), (0.0, 0.5), (0.0, 0.0, 0.0), (-1.1, 0.0, -0.2))),
-        (2.0, _pose(0.1, -0.3, -0.8, (0.0, 0.0, -0.3), (0.0, 0.5), (0.0, 0.0, 0.0), (-1.0, 0.0, -0.1))),
+        (
+            0.0,
+            _pose(0.05, 0.3, 0.9, (1.2, 0.0, 1.2), (0.0, 1.0), (0.0, 0.0, 0.0), (-1.2, 0.0, -0.3)),
+        ),
+        (
+            0.6,
+            _pose(0.05, 0.3, 1.0, (1.1, 0.0, 1.5), (0.0, 1.0), (0.0, 0.0, 0.3), (-1.2, 0.0, -0.3)),
+        ),
+        (
+            1.0,
+            _pose(0.1, 0.0, 0.2, (0.8, 0.0, 0.9), (0.0, 0.5), (0.0, 0.0, 0.0), (-1.1, 0.0, -0.2)),
+        ),
+        (
+            2.0,
+            _pose(
+                0.1, -0.3, -0.8, (0.0, 0.0, -0.3), (0.0, 0.5), (0.0, 0.0, 0.0), (-1.0, 0.0, -0.1)
+            ),
+        ),
     ),
 }
 """Key poses of a first guess by time: 0 to 1 until the impact, 1 to 2 after it."""

@@ -1,0 +1,197 @@
+"""Javelin: a throw from a stand with a prescribed speed, angle and height at the release.
+
+The SMPL athlete has no fingers: the javelin (0.8 kg, 2.7 m) is rigid on its right palm, nose along
+the wrist's -x as in the task's hold, until the hand opens within ``OPENING`` at the release; after
+that the athlete moves without it. At the release it points where it flies and does not turn. Both
+feet stay where they stand. Drag-free distance: v cos(a) (v sin(a) + sqrt(v^2 sin(a)^2 + 2 g h)) / g.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from sports.humanoid.body import Body, load_body
+from sports.humanoid.hold import JAVELIN_RADIUS
+from sports.javelin import END
+from warmstart.contact import Ball
+from warmstart.phases import Phase
+from warmstart.problems import jumper, striker
+from warmstart.solution import Solution
+from warmstart.transcription import Transcription
+
+LINK = "R_Wrist"
+GRIP = (-0.007, -0.06, -0.045)
+"""The javelin's centre of mass on that link (m), as in ``sports/humanoid/data/equipment.csv``."""
+NOSE = (-1.0, 0.0, 0.0)
+ENDS = tuple(
+    Ball(LINK, (GRIP[0] + side * END, GRIP[1], GRIP[2]), JAVELIN_RADIUS) for side in (-1.0, 1.0)
+)
+OPENING = 0.002
+"""Time in which the hand opens (s)."""
+FEET = {"L": "flat", "R": "flat"}
+SWING, FOLLOW = (0.35, 0.70), (0.30, 0.50)
+"""Durations (s) until the release, and after it."""
+TILT = math.radians(35.0)
+"""How far the held javelin may point from where it will fly."""
+SPIN = 1.0
+"""How fast the javelin may turn at the release (rad/s, each axis)."""
+
+
+@dataclass(frozen=True)
+class Config(striker.Config):
+    """Options of the javelin problem."""
+
+    release_speed: float = 14.0
+    """Speed of the javelin at the release (m/s)."""
+    angle: float = 36.0
+    """Of its velocity above the horizontal (degrees)."""
+    height: float = 1.75
+    """Of its centre of mass above the ground (m)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 4.0 <= self.release_speed <= 34.0:
+            raise ValueError(
+                f"release_speed must lie between 4 and 34 m/s, not {self.release_speed}: world "
+                "class is 33 m/s"
+            )
+        if not 0.0 <= self.angle <= 60.0:
+            raise ValueError(f"angle must lie between 0 and 60 degrees, not {self.angle}")
+        if not 1.3 <= self.height <= 2.2:
+            raise ValueError(f"height must lie between 1.3 and 2.2 m, not {self.height}")
+
+
+def make_event(config: Config) -> striker.Event:
+    """What the hand must do at the release."""
+    a = math.radians(config.angle)
+    forward = (math.cos(a), 0.0, math.sin(a))
+    velocity = tuple(config.release_speed * x for x in forward)
+    place = (0.0, 0.0, config.height)
+    return striker.Event(LINK, GRIP, NOSE, place, velocity, forward, fixed=(2,), spin=SPIN)
+
+
+def transcribe(
+    config: Config, body: Body, bare: Body, event: striker.Event, elastic: bool = False
+) -> Transcription:
+    """The nonlinear program."""
+    knots = jumper.scaled(config.detail)
+    phases = [
+        Phase("swing", knots(32), SWING, FEET),
+        Phase("release", 1, (OPENING, OPENING), FEET, abrupt=True),
+        Phase("follow", knots(14), FOLLOW, FEET, loaded=False),
+    ]
+    program = striker.transcribe(
+        body,
+        event,
+        phases,
+        config,
+        position=POSITION,
+        held_limits=HELD_LIMITS,
+        unloaded=bare,
+        feet=((0.15, 0.6), (0.2, 0.7)),
+        elastic=elastic,
+    )
+    held = np.array([k for k in range(program.K) if program.model_at(k) is program.model])
+    program.ground(ENDS, held, margin=0.05)
+    striker.shaft_off(program, body, event, JAVELIN_RADIUS, held)
+    link, forward = program.model.tree.link(LINK), list(event.normal)
+
+    def point(q, p):
+        nose = program.model.motion(q).R_WL[link] @ ca.DM(list(NOSE))
+        return [("nose", ca.dot(nose, ca.DM(forward)), math.cos(TILT), np.inf)]
+
+    program.rows("nose", held, point)
+    for name, (low, high) in READY.items():
+        program.bound(program.q[0, program.model.index(name)], low, high)
+    for name in ("pitch", "roll"):
+        program.bound(program.q[-1, program.model.index(name)], -0.2, 0.35)
+    return program
+
+
+HELD_LIMITS = (
+    *striker.HELD_LIMITS[:4],
+    *(d for d in striker.HELD_LIMITS[7:]),
+)
+POSITION = {
+    "yaw": (-1.6, 0.8),
+    "Knee_y": (0.1, 1.6),
+    "R_Shoulder_x": (-1.4, 0.8),
+    "R_Shoulder_y": (-1.4, 1.4),
+    "R_Shoulder_z": (-1.2, 1.9),
+    "R_Elbow_y": (-1.5, 1.5),
+    "R_Wrist_x": (-1.0, 1.0),
+    "R_Wrist_y": (-1.7, 1.7),
+    "R_Wrist_z": (-1.2, 1.2),
+}
+"""Pose boxes (rad) that differ from those of a stroke: the throwing arm works overhead."""
+READY = {"yaw": (-1.4, 0.0), "L_Shoulder_x": (-1.45, 0.2)}
+
+
+def _pose(x, yaw, twist, bend, arm, elbow, wrist) -> dict[str, float]:
+    return {
+        "x": x,
+        "yaw": yaw,
+        "Torso_y": bend,
+        "Chest_y": bend,
+        "Torso_z": 0.4 * twist,
+        "Spine_z": 0.3 * twist,
+        "Chest_z": 0.3 * twist,
+        **dict(zip((f"R_Shoulder_{a}" for a in "xyz"), arm, strict=True)),
+        **dict(zip(("R_Elbow_y", "R_Elbow_z"), elbow, strict=True)),
+        **dict(zip((f"R_Wrist_{a}" for a in "xyz"), wrist, strict=True)),
+        "L_Shoulder_x": -0.9,
+        "L_Shoulder_z": -0.6,
+        "L_Elbow_z": -0.8,
+    }
+
+
+KEYS = (
+    (0.0, _pose(-0.08, -0.7, -0.8, -0.1, (-0.2, -1.0, -0.4), (-1.0, 0.6), (0.0, -1.0, 0.0))),
+    (0.6, _pose(0.0, -0.3, -0.3, -0.1, (-0.4, -1.0, 0.0), (-1.0, 1.2), (0.0, -1.0, 0.0))),
+    (1.0, _pose(0.1, 0.1, 0.3, 0.1, (-0.6, -1.0, 0.4), (-1.0, 0.6), (0.0, -1.0, 0.0))),
+    (2.0, _pose(0.15, 0.3, 0.8, 0.3, (0.2, -0.8, 1.2), (-0.8, 0.6), (0.0, -1.0, 0.0))),
+)
+"""Key poses of a first guess by time: 0 to 1 until the release, 1 to 2 after it."""
+
+
+def first_guess(program: Transcription) -> np.ndarray:
+    """Key poses on both feet."""
+    durations = (0.55, OPENING, 0.40)
+    base = striker.stand(program.model, program.body, 0.2, 0.1)
+    base |= {"L_Hip_y": -0.5, "R_Hip_y": 0.1, "L_Ankle_y": 0.0, "R_Ankle_y": -0.5}
+    times, frames = zip(*((t, base | pose) for t, pose in KEYS), strict=True)
+    seconds = np.interp(times, (0.0, 1.0, 2.0), (0.0, durations[0], sum(durations)))
+    at = program.nominal_times(durations)
+    return program.guess(jumper.key_frames(program.model, seconds, frames, at), durations)
+
+
+def solve(
+    config: Config,
+    guess: Solution | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> Solution:
+    """The least-effort throw. See :meth:`warmstart.problems.Problem.solve`."""
+    body = load_body("smpl", strength=config.strength, equipment=["javelin"])
+    bare = load_body("smpl", strength=config.strength)
+    event = make_event(config)
+    return striker.solve(
+        "javelin",
+        {
+            "release_speed": config.release_speed,
+            "angle": config.angle,
+            "height": config.height,
+        },
+        event,
+        lambda elastic: transcribe(config, body, bare, event, elastic),
+        first_guess,
+        guess,
+        config,
+        progress,
+        f"a throw of {config.release_speed:g} m/s at {config.angle:g} degrees",
+        thrown=("javelin", OPENING),
+    )
