@@ -10,9 +10,7 @@ from sports.javelin import END, LINE_X
 from sports.physics.base import GRAVITY
 
 
-def distance(
-    place: np.ndarray, velocity: np.ndarray, nose: np.ndarray, drag: bool = True
-) -> float:
+def distance(place: np.ndarray, velocity: np.ndarray, nose: np.ndarray, drag: bool = True) -> float:
     """Where a javelin first meets the ground, beyond the line (m).
 
     ``place`` (3,) and ``velocity`` (3,) of its centre at the release, ``nose`` (3,) unit; without

@@ -36,8 +36,12 @@ OPENING = 0.002
 FEET = {"L": "flat", "R": "flat"}
 SWING, FOLLOW = (0.35, 0.70), (0.30, 0.50)
 """Durations (s) until the release, and after it."""
+DURATIONS = (0.70, OPENING, 0.30)
+"""Of the phases in a first guess (s)."""
 TILT = math.radians(35.0)
 """How far the held javelin may point from where it will fly."""
+SHEAR = 150.0
+"""Weight of horizontal force on the feet: a throw pushes harder than a stroke."""
 SPIN = 1.0
 """How fast the javelin may turn at the release (rad/s, each axis)."""
 
@@ -93,6 +97,7 @@ def transcribe(
         position=POSITION,
         held_limits=HELD_LIMITS,
         unloaded=bare,
+        shear=SHEAR,
         feet=((0.15, 0.6), (0.2, 0.7)),
         elastic=elastic,
     )
@@ -132,44 +137,6 @@ POSITION = {
 READY = {"yaw": (-1.4, 0.0), "L_Shoulder_x": (-1.45, 0.2)}
 
 
-def _pose(x, yaw, twist, bend, arm, elbow, wrist) -> dict[str, float]:
-    return {
-        "x": x,
-        "yaw": yaw,
-        "Torso_y": bend,
-        "Chest_y": bend,
-        "Torso_z": 0.4 * twist,
-        "Spine_z": 0.3 * twist,
-        "Chest_z": 0.3 * twist,
-        **dict(zip((f"R_Shoulder_{a}" for a in "xyz"), arm, strict=True)),
-        **dict(zip(("R_Elbow_y", "R_Elbow_z"), elbow, strict=True)),
-        **dict(zip((f"R_Wrist_{a}" for a in "xyz"), wrist, strict=True)),
-        "L_Shoulder_x": -0.9,
-        "L_Shoulder_z": -0.6,
-        "L_Elbow_z": -0.8,
-    }
-
-
-KEYS = (
-    (0.0, _pose(-0.08, -0.7, -0.8, -0.1, (-0.2, -1.0, -0.4), (-1.0, 0.6), (0.0, -1.0, 0.0))),
-    (0.6, _pose(0.0, -0.3, -0.3, -0.1, (-0.4, -1.0, 0.0), (-1.0, 1.2), (0.0, -1.0, 0.0))),
-    (1.0, _pose(0.1, 0.1, 0.3, 0.1, (-0.6, -1.0, 0.4), (-1.0, 0.6), (0.0, -1.0, 0.0))),
-    (2.0, _pose(0.15, 0.3, 0.8, 0.3, (0.2, -0.8, 1.2), (-0.8, 0.6), (0.0, -1.0, 0.0))),
-)
-"""Key poses of a first guess by time: 0 to 1 until the release, 1 to 2 after it."""
-
-
-def first_guess(program: Transcription) -> np.ndarray:
-    """Key poses on both feet."""
-    durations = (0.55, OPENING, 0.40)
-    base = striker.stand(program.model, program.body, 0.2, 0.1)
-    base |= {"L_Hip_y": -0.5, "R_Hip_y": 0.1, "L_Ankle_y": 0.0, "R_Ankle_y": -0.5}
-    times, frames = zip(*((t, base | pose) for t, pose in KEYS), strict=True)
-    seconds = np.interp(times, (0.0, 1.0, 2.0), (0.0, durations[0], sum(durations)))
-    at = program.nominal_times(durations)
-    return program.guess(jumper.key_frames(program.model, seconds, frames, at), durations)
-
-
 def solve(
     config: Config,
     guess: Solution | None = None,
@@ -188,7 +155,7 @@ def solve(
         },
         event,
         lambda elastic: transcribe(config, body, bare, event, elastic),
-        first_guess,
+        lambda program: striker.key_guess(program, "javelin", DURATIONS),
         guess,
         config,
         progress,

@@ -9,8 +9,10 @@ turns its outcome into an event, and puts the finished motion where its sport ha
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import resources
 from typing import Any
 
 import casadi as ca
@@ -23,7 +25,7 @@ from warmstart.nlp import Result
 from warmstart.outcome import link_poses
 from warmstart.phases import Bounds, Phase, Weights
 from warmstart.problems import jumper
-from warmstart.rigid_body import ReducedModel, load_tree, reduce_tree
+from warmstart.rigid_body import load_tree, reduce_tree
 from warmstart.separation import axis_balls
 from warmstart.solution import Solution
 from warmstart.transcription import Transcription
@@ -103,6 +105,8 @@ COMFORT = {
 """Angles (rad) to which a small price draws the posture: upright, and an idle arm at rest."""
 TOOL_ROOM = 0.04
 """What is held keeps this far (m) off the body at knots: it moves 0.4 m between two of them."""
+CORNERS = 0.03
+"""How far (m) the corners of the head stick out of its balls."""
 PRICE = 4e-3
 """Cost of a squared radian off :data:`COMFORT` at one knot."""
 
@@ -200,6 +204,7 @@ def transcribe(
     unloaded: Body | None = None,
     feet: tuple[tuple[float, float], tuple[float, float]] = ((0.4, 0.75), (-0.3, 0.3)),
     bounds: Mapping[str, float] | None = None,
+    shear: float = SHEAR,
     elastic: bool = False,
 ) -> Transcription:
     """The nonlinear program of a strike or throw; its parameters are the event's.
@@ -223,7 +228,7 @@ def transcribe(
             boxes(RATE, free),
             **{"hinge_rate": 35.0, "acceleration": 1000.0, "torque_share": SHARE, **(bounds or {})},
         ),
-        Weights(shear=SHEAR),
+        Weights(shear=shear),
         held_limits=held_limits,
         parameters=PARAMETERS,
         elastic=elastic,
@@ -297,13 +302,14 @@ def _end(body: Body, link: str) -> Ball:
 
 
 def _forearm(body: Body, side: str) -> list[Ball]:
-    return [*axis_balls(body, f"{side}_Elbow"), _end(body, f"{side}_Hand")]
+    return [*axis_balls(body, f"{side}_Elbow", 3), _end(body, f"{side}_Hand")]
 
 
 def obstacles(body: Body) -> list[Ball]:
     """What a thing in the right hand can meet: trunk, head, upper arms, left arm, thighs."""
     return [
         *(_end(body, link) for link in TRUNK),
+        *(replace(b, radius=b.radius + CORNERS) for b in axis_balls(body, "Head")),
         *_forearm(body, "L")[1:],
         *(b for s in "LR" for b in axis_balls(body, f"{s}_Hip", 3)),
         *(b for s in "LR" for b in axis_balls(body, f"{s}_Shoulder", 3)[1:]),
@@ -342,7 +348,13 @@ def arms_off(program: Transcription, body: Body, knots) -> None:
     trunk = [_end(body, link) for link in TRUNK]
     pairs = [(a, b) for s in "LR" for a in arms[s][1:] for b in trunk]
     pairs += [(a, b) for a in arms["L"] for b in arms["R"]]
-    pairs += [(_end(body, f"{s}_Shoulder"), _end(body, "Head")) for s in "LR"]
+    for side, other in ("LR", "RL"):  # an arm across the chest
+        beyond = [_end(body, f"{other}_Thorax"), *axis_balls(body, f"{other}_Shoulder")]
+        pairs += [(a, b) for a in arms[side] for b in beyond]
+    head = [replace(b, radius=b.radius + CORNERS / 2) for b in axis_balls(body, "Head")]
+    pairs += [
+        (a, b) for s in "LR" for a in axis_balls(body, f"{s}_Shoulder", 3)[1:] for b in head
+    ]
     pairs += [(axis_balls(body, "L_Knee")[0], axis_balls(body, "R_Knee")[0])]
     keep_off(program, pairs, knots)
 
@@ -365,35 +377,21 @@ def keep_off(
     program.rows("keep off", knots, off)
 
 
-def stand(model: ReducedModel, body: Body, bend: float = 0.25, width: float = 0.1) -> dict:
-    """A standing pose: knees bent by 2 ``bend`` (rad), hips spread by ``width`` (rad), soles flat
-    on the ground (root height z)."""
-    pose = {}
-    for side, sign in (("L", 1.0), ("R", -1.0)):
-        pose |= {
-            f"{side}_Hip_y": -bend,
-            f"{side}_Knee_y": 2 * bend,
-            f"{side}_Ankle_y": -bend,
-            f"{side}_Hip_x": sign * width,
-            f"{side}_Ankle_x": -sign * width,
-        }
-    frame = jumper.key_frames(model, [0.0, 1.0], [pose, pose], np.zeros(1))
-    q = ca.SX.sym("q", model.n)
-    heights = ca.Function(
-        "sole",
-        [q],
-        [
-            ca.vertcat(
-                *[
-                    model.motion(q).point(model.tree.link(b.link), b.center)[2]
-                    for b in jumper.foot(body, "L")
-                    if b.link.endswith("Toe")
-                ]
-            )
-        ],
-    )
-    pose["z"] = -float(np.array(heights(frame[0])).min())
-    return pose
+def key_guess(program: Transcription, name: str, durations: Sequence[float]) -> np.ndarray:
+    """A first guess from key poses (``keys/NAME.csv``) and the durations of the phases (s).
+
+    The first column is a time: 0 at the start, 1 at the event, 2 at the end; the others are
+    reduced coordinates by name. The poses are those of an earlier solution, rounded to 0.01: a
+    program without them takes two to five times as long.
+    """
+    text = resources.files("warmstart.problems").joinpath("keys", f"{name}.csv").read_text()
+    rows = list(csv.DictReader(text.splitlines()))
+    times = [float(row.pop("time")) for row in rows]
+    frames = [{k: float(v) for k, v in row.items() if k in program.model.names} for row in rows]
+    at = program.nominal_times(durations)
+    event = at[program.knots("swing")[-1]]
+    seconds = np.interp(times, (0.0, 1.0, 2.0), (0.0, event, at[-1]))
+    return program.guess(jumper.key_frames(program.model, seconds, frames, at), durations)
 
 
 def solve(

@@ -43,6 +43,8 @@ YAW = math.pi
 FEET = {"L": "flat", "R": "flat"}
 SWING, FOLLOW = (0.40, 0.75), (0.30, 0.50)
 """Durations (s) until the impact, and after it."""
+DURATIONS = (0.66, 0.35)
+"""The same of a first guess."""
 
 
 @dataclass(frozen=True)
@@ -168,147 +170,6 @@ READY = {
 BACKHAND_POSITION = {"R_Shoulder_z": (-0.9, 2.1), "R_Elbow_y": (-1.2, 1.2)}
 
 
-def _pose(x: float, yaw: float, twist: float, arm, elbow, wrist, left) -> dict[str, float]:
-    """A key pose: root x and yaw, twist of the trunk, right shoulder x, y, z, elbow y, z, wrist
-    x, y, z and left shoulder x, y, z (rad)."""
-    return {
-        "x": x,
-        "pitch": 0.1,
-        "yaw": yaw,
-        "Torso_y": 0.15,
-        "Chest_y": 0.2,
-        "Torso_z": 0.4 * twist,
-        "Spine_z": 0.3 * twist,
-        "Chest_z": 0.3 * twist,
-        **dict(zip((f"R_Shoulder_{a}" for a in "xyz"), arm, strict=True)),
-        **dict(zip(("R_Elbow_y", "R_Elbow_z"), elbow, strict=True)),
-        **dict(zip((f"R_Wrist_{a}" for a in "xyz"), wrist, strict=True)),
-        **dict(zip((f"L_Shoulder_{a}" for a in "xyz"), left, strict=True)),
-        "L_Elbow_z": -1.0,
-    }
-
-
-KEYS = {
-    "forehand": (
-        (
-            0.0,
-            _pose(
-                0.06,
-                -0.3,
-                -1.1,
-                (1.2, -0.5, -0.4),
-                (-0.75, 0.5),
-                (-0.5, 0.7, -0.7),
-                (-0.9, -0.7, -0.6),
-            ),
-        ),
-        (
-            0.37,
-            _pose(
-                0.06,
-                -0.25,
-                -0.8,
-                (1.3, -0.55, -0.7),
-                (-0.75, 0.3),
-                (-0.5, 0.6, -0.7),
-                (-0.95, -0.7, -0.3),
-            ),
-        ),
-        (
-            0.75,
-            _pose(
-                0.09,
-                -0.03,
-                -0.2,
-                (1.4, -0.7, -0.8),
-                (-0.8, 0.15),
-                (-0.55, 0.2, -0.7),
-                (-1.05, -0.65, -0.2),
-            ),
-        ),
-        (
-            0.90,
-            _pose(
-                0.11,
-                0.07,
-                0.3,
-                (1.2, -0.85, -0.5),
-                (-0.8, 0.4),
-                (-0.5, -0.3, -0.7),
-                (-1.05, -0.6, -0.2),
-            ),
-        ),
-        (
-            1.0,
-            _pose(
-                0.11,
-                0.1,
-                0.55,
-                (0.7, -0.9, 0.15),
-                (-0.75, 0.8),
-                (-0.35, -0.75, -0.55),
-                (-1.05, -0.6, -0.2),
-            ),
-        ),
-        (
-            1.3,
-            _pose(
-                0.13,
-                0.13,
-                0.9,
-                (-0.2, -0.8, 1.1),
-                (-0.45, 1.15),
-                (0.05, -1.1, -0.25),
-                (-1.05, -0.6, -0.3),
-            ),
-        ),
-        (
-            2.0,
-            _pose(
-                0.15,
-                0.2,
-                1.1,
-                (-0.4, -0.65, 1.4),
-                (-0.25, 1.1),
-                (0.2, -1.1, -0.2),
-                (-1.05, -0.65, -0.3),
-            ),
-        ),
-    ),
-    "backhand": (
-        (
-            0.0,
-            _pose(0.05, 0.3, 0.9, (1.2, 0.0, 1.2), (0.0, 1.0), (0.0, 0.0, 0.0), (-1.2, 0.0, -0.3)),
-        ),
-        (
-            0.6,
-            _pose(0.05, 0.3, 1.0, (1.1, 0.0, 1.5), (0.0, 1.0), (0.0, 0.0, 0.3), (-1.2, 0.0, -0.3)),
-        ),
-        (
-            1.0,
-            _pose(0.1, 0.0, 0.2, (0.8, 0.0, 0.9), (0.0, 0.5), (0.0, 0.0, 0.0), (-1.1, 0.0, -0.2)),
-        ),
-        (
-            2.0,
-            _pose(
-                0.1, -0.3, -0.8, (0.0, 0.0, -0.3), (0.0, 0.5), (0.0, 0.0, 0.0), (-1.0, 0.0, -0.1)
-            ),
-        ),
-    ),
-}
-"""Key poses of a first guess by time: 0 to 1 until the impact, 1 to 2 after it."""
-
-
-def first_guess(program: Transcription, side: str) -> np.ndarray:
-    """Key poses on both feet."""
-    durations = (0.66, 0.35)
-    base = striker.stand(program.model, program.body, 0.15, 0.15)
-    times, frames = zip(*((t, base | pose) for t, pose in KEYS[side]), strict=True)
-    seconds = np.interp(times, (0.0, 1.0, 2.0), np.cumsum((0.0, *durations)))
-    at = program.nominal_times(durations)
-    return program.guess(jumper.key_frames(program.model, seconds, frames, at), durations)
-
-
 def solve(
     config: Config,
     guess: Solution | None = None,
@@ -329,7 +190,7 @@ def solve(
         asked,
         event,
         lambda elastic: transcribe(config, body, event, elastic),
-        lambda program: first_guess(program, config.side),
+        lambda program: striker.key_guess(program, f"tennis_{config.side}", DURATIONS),
         guess,
         config,
         progress,
