@@ -130,8 +130,9 @@ class Certificate:
     asked: dict[str, float]
     strength: str
     achieved: dict[str, float]
-    """``planned``, ``replay_mujoco``, ``replay_drake``: the outcome (m; m/s of a strike); 0 for a replay that made
-    no valid attempt (open loop, a jump may fall), missing if it could not be computed."""
+    """``planned``, ``replay_mujoco``, ``replay_drake``: the outcome (m; m/s of a strike or
+    throw); 0 for a replay that made no valid attempt (open loop, a jump may fall), missing if it
+    could not be computed."""
     checks: tuple[Check, ...]
     stats: dict[str, Any]
 

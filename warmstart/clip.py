@@ -269,6 +269,7 @@ def clip_from_solution(solution: Solution, fps: float = 30.0) -> Clip:
             "problem": solution.problem,
             "asked": dict(solution.asked),
             "strength": solution.strength,
+            **({"equipment": list(equipment)} if (equipment := solution.body.equipment) else {}),
             "source": "trajectory optimisation",
             "licence": "Apache-2.0",
             "events": contact_events(solution),

@@ -12,9 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from warmstart.certificate import Certificate, certify
-from warmstart.clip import Clip
-from warmstart.outcome import OUTCOMES
+from warmstart.clip import Clip, clip_from_solution
+from warmstart.judged import RULES
+from warmstart.outcome import OUTCOMES, link_poses
+from warmstart.replay import REPLAY_RATE, replay_states
 from warmstart.solution import Solution
 from warmstart.tracking import Tracking, track_best
 
@@ -44,7 +48,8 @@ def demonstrate(
     threads: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Demonstration:
-    """Certifies a solution and tracks it in its task.
+    """Certifies a solution and tracks it in its task; a strike or throw, whose gate asks for a
+    replay that reaches the outcome, is that replay in MuJoCo.
 
     A ``certificate`` of the solution, where there is one already, is taken as it is. Raises
     ValueError when the solution's problem is no task.
@@ -52,6 +57,8 @@ def demonstrate(
     certificate = certificate or certify(solution)
     if not certificate.passed:
         return Demonstration(certificate, None, "; ".join(certificate.failures))
+    if solution.problem in RULES:
+        return Demonstration(certificate, strike_clip(solution, certificate), "")
     try:
         tracked = track_best(
             solution, settings, attempts=attempts, threads=threads, progress=progress
@@ -70,6 +77,59 @@ def demonstrate(
     if not tracked.success:
         reason = f"tracked in MuJoCo, the task calls it no success: {clip.meta['achieved']}"
     return Demonstration(certificate, replace(clip, meta=meta), reason)
+
+
+def strike_clip(solution: Solution, certificate: Certificate, fps: float = 60.0) -> Clip:
+    """The replay of a certified strike or throw in MuJoCo as a clip, labelled with its figures.
+
+    ``ctrl`` are the targets averaged over each frame. Raises RuntimeError when it diverges.
+    """
+    planned = clip_from_solution(solution, fps)
+    times, qpos, qvel = replay_states(solution, "mujoco", hold=0.0)
+    rows = np.round(planned.times * REPLAY_RATE).astype(int)
+    rows = rows[rows < len(times)]
+    assert planned.ctrl is not None
+    width = planned.qpos.shape[1]
+    motion = solution.sample(solution.times[0] + times[rows])["qpos"]
+    places, _ = link_poses(solution.body, qpos[rows, :width])
+    wanted, _ = link_poses(solution.body, motion)
+    error = np.linalg.norm(places - wanted, axis=2)
+    head = "replay in mujoco: "
+    achieved = {
+        c.name.removeprefix(head).replace(":", "").replace(" ", "_"): c.value
+        for c in certificate.checks
+        if c.name.startswith(head)
+    }
+    achieved[RULES[solution.problem].field] = achieved.pop("outcome")
+    event, options = solution.stats["event"], solution.stats.get("options", {})
+    meta = {
+        **planned.meta,
+        "source": "trajectory optimisation, replayed in MuJoCo",
+        "achieved": {k: round(v, 6) for k, v in achieved.items()},
+        "options": options,
+        "events": {"strike" if RULES[solution.problem].nearest else "release": event["time"]},
+        "certified": True,
+        "planned": certificate.achieved.get("planned"),
+        "link_error": float(np.sqrt(np.mean(error**2))),
+        "root_error": float(error[:, 0].max()),
+    }
+    return replace(
+        planned,
+        qpos=qpos[rows, :width],
+        qvel=qvel[rows, : width - 1],
+        ctrl=planned.ctrl[: len(rows)],
+        meta=meta,
+    )
+
+
+def name_of(solution: Solution) -> str:
+    """Of a demonstration's file: problem, the side of a stroke, outcome, strength."""
+    problem, side = solution.problem, solution.stats.get("options", {}).get("side")
+    rules = RULES.get(problem)
+    asked = solution.asked[rules.field if rules else OUTCOMES[problem].field]
+    unit = rules.unit.replace("/", "p") if rules else "m"
+    words = [problem, *([side] if side else []), f"{asked:g}{unit}", solution.strength]
+    return "_".join(words)
 
 
 def save_demonstration(found: Demonstration, clip_path: Path, certificate_path: Path) -> None:
@@ -91,11 +151,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             solution = Solution.load(path)
             found = demonstrate(solution, attempts=options.attempts)
-            asked = solution.asked[OUTCOMES[solution.problem].field]
+            name = name_of(solution)
         except (ValueError, KeyError) as error:
             print(f"{path}: {error}", file=sys.stderr)
             return 2
-        name = f"{solution.problem}_{asked:g}m_{solution.strength}"
         if found.passed:
             out = options.out
             save_demonstration(found, out / f"{name}.npz", out / f"{name}.json")

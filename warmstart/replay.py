@@ -16,7 +16,7 @@ import torch
 from sports.env import Starts, make_env, make_scene
 from sports.humanoid.body import Body, load_body
 from sports.physics import PhysicsState, make_physics
-from sports.registry import task_names
+from sports.registry import get_task, task_names
 from sports.scene import Scene, humanoid_scene
 from warmstart.clip import Clip
 from warmstart.solution import Solution
@@ -101,14 +101,21 @@ def scene_options(clip: Clip) -> dict[str, Any]:
 
 
 def body_of(clip: Clip) -> Body:
-    """The athlete of a clip at the strength its metadata names (``paper`` without one)."""
-    return load_body(clip.body, strength=clip.meta.get("strength", "paper"))
+    """The athlete of a clip at the strength (``paper`` without one) and with the equipment that its
+    metadata names."""
+    meta = clip.meta
+    return load_body(
+        clip.body,
+        strength=meta.get("strength", "paper"),
+        equipment=meta.get("equipment", ()),
+    )
 
 
 def scene_of(clip: Clip) -> Scene:
-    """The scene of the clip's problem, or the athlete alone where no task has that name."""
+    """The scene of the clip's problem, or the athlete alone where no task of its body has that
+    name (a javelin thrown by the body without fingers)."""
     problem = clip.meta.get("problem")
-    if problem in task_names():
+    if problem in task_names() and get_task(problem).body == clip.body:
         return make_scene(
             problem, strength=clip.meta.get("strength", "paper"), options=scene_options(clip)
         )

@@ -338,7 +338,7 @@ def _launched(told: dict) -> Ball:
 
 def _judged(game: Game, solution: Solution, struck: Ball) -> dict[str, float]:
     after = ball_after(game, struck)
-    target = np.array([solution.asked["target_x"], solution.asked["target_y"]])
+    target = np.array(solution.stats["ball"]["target"])
     if after is None:
         off, over = LOST, -LOST
     else:

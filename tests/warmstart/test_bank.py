@@ -94,8 +94,8 @@ def test_an_environment_starts_from_the_frames_and_their_bar():
 
 
 def test_unknown_problem_is_refused():
-    with pytest.raises(ValueError, match="unknown problem 'golf'; known: high_jump, long_jump"):
-        load_demonstrations("golf")
+    with pytest.raises(ValueError, match="unknown problem 'shot_put'; known: high_jump, long_jump"):
+        load_demonstrations("shot_put")
 
 
 def test_shipped_demonstrations_are_small_and_certified():

@@ -69,6 +69,22 @@ PROBLEMS: dict[str, Problem] = {
             sweep=(3.0, 5.0, 7.0),
             module="warmstart.problems.long_jump",
         ),
+        Problem(
+            name="tennis",
+            summary="forehand or backhand that returns a machine's ball to a target",
+            outcome="ball_speed",
+            unit="m/s",
+            sweep=(20.0, 24.0, 28.0),
+            module="warmstart.problems.tennis",
+        ),
+        Problem(
+            name="javelin",
+            summary="throw from a stand at a given release speed, angle and height",
+            outcome="release_speed",
+            unit="m/s",
+            sweep=(10.0, 12.0, 14.0),
+            module="warmstart.problems.javelin",
+        ),
     )
 }
 

@@ -3,7 +3,7 @@
 The SMPL athlete has no fingers: the javelin (0.8 kg, 2.7 m) is rigid on its right palm, nose along
 the wrist's -x as in the task's hold, until the hand opens within ``OPENING`` at the release; after
 that the athlete moves without it. At the release it points where it flies and does not turn. Both
-feet stay where they stand. Drag-free distance: v cos(a) (v sin(a) + sqrt(v^2 sin(a)^2 + 2 g h)) / g.
+feet stay where they stand.
 """
 
 from __future__ import annotations
@@ -40,8 +40,10 @@ DURATIONS = (0.70, OPENING, 0.30)
 """Of the phases in a first guess (s)."""
 TILT = math.radians(35.0)
 """How far the held javelin may point from where it will fly."""
-SHEAR = 150.0
+SHEAR = 600.0
 """Weight of horizontal force on the feet: a throw pushes harder than a stroke."""
+STRAIGHT = 170.0
+"""How much the javelin may be accelerated across its way at the release (m/s^2)."""
 SPIN = 1.0
 """How fast the javelin may turn at the release (rad/s, each axis)."""
 
@@ -50,7 +52,7 @@ SPIN = 1.0
 class Config(striker.Config):
     """Options of the javelin problem."""
 
-    release_speed: float = 14.0
+    release_speed: float = 12.0
     """Speed of the javelin at the release (m/s)."""
     angle: float = 36.0
     """Of its velocity above the horizontal (degrees)."""
@@ -76,7 +78,9 @@ def make_event(config: Config) -> striker.Event:
     forward = (math.cos(a), 0.0, math.sin(a))
     velocity = tuple(config.release_speed * x for x in forward)
     place = (0.0, 0.0, config.height)
-    return striker.Event(LINK, GRIP, NOSE, place, velocity, forward, fixed=(2,), spin=SPIN)
+    return striker.Event(
+        LINK, GRIP, NOSE, place, velocity, forward, fixed=(2,), spin=SPIN, straight=STRAIGHT
+    )
 
 
 def transcribe(
@@ -98,7 +102,7 @@ def transcribe(
         held_limits=HELD_LIMITS,
         unloaded=bare,
         shear=SHEAR,
-        feet=((0.15, 0.6), (0.2, 0.7)),
+        feet=((0.15, 0.6), (0.2, 0.9)),
         elastic=elastic,
     )
     held = np.array([k for k in range(program.K) if program.model_at(k) is program.model])
@@ -148,11 +152,7 @@ def solve(
     event = make_event(config)
     return striker.solve(
         "javelin",
-        {
-            "release_speed": config.release_speed,
-            "angle": config.angle,
-            "height": config.height,
-        },
+        {"release_speed": config.release_speed},
         event,
         lambda elastic: transcribe(config, body, bare, event, elastic),
         lambda program: striker.key_guess(program, "javelin", DURATIONS),

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from typing import Any
 
@@ -19,6 +19,7 @@ import casadi as ca
 import numpy as np
 
 from sports.humanoid.body import Body, Strength
+from sports.physics.base import GRAVITY
 from warmstart import rotation
 from warmstart.contact import Ball
 from warmstart.nlp import Result
@@ -92,7 +93,7 @@ RATE = {
 SHARE = 0.93
 """Share of a torque limit that a stroke may use at knots: it is used at its peak for one knot, and
 more between two."""
-SHEAR = 30.0
+SHEAR = 150.0
 """Weight of the horizontal force on each foot."""
 TRUNK = ("Pelvis", "Torso", "Chest", "Head")
 COMFORT = {
@@ -148,6 +149,9 @@ class Event:
     """Coordinates of ``place`` that are prescribed; the others are the optimiser's."""
     spin: float = np.inf
     """Largest component of the link's angular velocity (rad/s)."""
+    straight: float = np.inf
+    """Largest acceleration of the point across ``normal``, each way (m/s^2): who is late by t
+    throws at an angle off by about t times this over the speed."""
 
     def parameters(self) -> list[float]:
         """The program's parameters: place, velocity, normal and two directions across it."""
@@ -158,7 +162,7 @@ class Event:
         return [float(x) for row in rows for x in row]
 
     def at(self, time: float, x: float, y: float, yaw: float) -> dict[str, Any]:
-        """The event in a solution's stats: at its time, in the world where :func:`placed` puts it."""
+        """The event in a solution's stats: at its time, where :func:`placed` puts it."""
         turn = rotation.exp(np.array([0.0, 0.0, yaw]))
         place, velocity, normal = (
             rotation.rotate(turn, np.array(v)) for v in (self.place, self.velocity, self.normal)
@@ -252,6 +256,18 @@ def transcribe(
         ]
 
     program.rows("event", [at], strike, rates=True)
+
+    def pull(q, v, a, p):
+        motion = model.motion(q, v, a)
+        c, w = ca.DM(list(event.point)), motion.w[link]
+        own = motion.acc[link] + ca.cross(motion.alpha[link], c) + ca.cross(w, ca.cross(w, c))
+        total = motion.R_WL[link] @ own - ca.DM([0.0, 0.0, GRAVITY])
+        across = ca.vertcat(ca.dot(total, p[9:12]), ca.dot(total, p[12:15]))
+        return 0.0, [("straight", across / 100.0, -event.straight / 100.0, event.straight / 100.0)]
+
+    if event.straight < np.inf:
+        here = [program.q[[at]], program.v[[at]], program.a[[at]]]
+        program.program.block("event pull", here, pull)
     rest(program)
     everywhere = np.arange(program.K)
     stance(program, body, *feet)
@@ -352,9 +368,9 @@ def arms_off(program: Transcription, body: Body, knots) -> None:
         beyond = [_end(body, f"{other}_Thorax"), *axis_balls(body, f"{other}_Shoulder")]
         pairs += [(a, b) for a in arms[side] for b in beyond]
     head = [replace(b, radius=b.radius + CORNERS / 2) for b in axis_balls(body, "Head")]
-    pairs += [
-        (a, b) for s in "LR" for a in axis_balls(body, f"{s}_Shoulder", 3)[1:] for b in head
-    ]
+    pairs += [(a, b) for s in "LR" for a in axis_balls(body, f"{s}_Shoulder", 3)[1:] for b in head]
+    waist = [_end(body, link) for link in ("Torso", "Spine")]
+    pairs += [(a, b) for s in "LR" for a in axis_balls(body, f"{s}_Shoulder", 3)[1:] for b in waist]
     pairs += [(axis_balls(body, "L_Knee")[0], axis_balls(body, "R_Knee")[0])]
     keep_off(program, pairs, knots)
 
@@ -427,6 +443,7 @@ def solve(
     time = float(program.times(result.x)[program.knots("swing")[-1]])
     if thrown is not None:
         stats["payload"] = {"equipment": thrown[0], "held": time, "gone": time + thrown[1]}
+    stats["options"] = asdict(config)
     solution = program.solution(name, asked, result, placed=list(where), **stats)
     at = event.at(time, *where)
     free = [i for i in range(3) if i not in event.fixed]

@@ -178,16 +178,9 @@ def solve(
     """The least-effort stroke. See :meth:`warmstart.problems.Problem.solve`."""
     body = load_body("smpl", strength=config.strength, equipment=["racket"])
     event, where, launched, ball, stroke = make_event(config, body)
-    asked = {
-        "ball_speed": config.ball_speed,
-        "target_x": config.target[0],
-        "target_y": config.target[1],
-        "machine_speed": config.machine_speed,
-        "backhand": float(config.side == "backhand"),
-    }
     return striker.solve(
         "tennis",
-        asked,
+        {"ball_speed": config.ball_speed},
         event,
         lambda elastic: transcribe(config, body, event, elastic),
         lambda program: striker.key_guess(program, f"tennis_{config.side}", DURATIONS),
@@ -200,6 +193,7 @@ def solve(
         ball={
             "launch": {"pos": launched.pos.tolist(), "linvel": launched.linvel.tolist()},
             "met": float(ball.time),
+            "target": list(config.target),
             "over_net": stroke.over_net,
         },
     )
