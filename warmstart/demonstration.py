@@ -100,7 +100,7 @@ def strike_clip(solution: Solution, certificate: Certificate, fps: float = 60.0)
         for c in certificate.checks
         if c.name.startswith(head)
     }
-    achieved[RULES[solution.problem].field] = achieved.pop("outcome")
+    achieved[RULES[solution.problem].outcome] = achieved.pop("outcome")
     event, options = solution.stats["event"], solution.stats.get("options", {})
     meta = {
         **planned.meta,
@@ -126,7 +126,7 @@ def name_of(solution: Solution) -> str:
     """Of a demonstration's file: problem, the side of a stroke, outcome, strength."""
     problem, side = solution.problem, solution.stats.get("options", {}).get("side")
     rules = RULES.get(problem)
-    asked = solution.asked[rules.field if rules else OUTCOMES[problem].field]
+    asked = solution.asked[rules.outcome if rules else OUTCOMES[problem].field]
     unit = rules.unit.replace("/", "p") if rules else "m"
     words = [problem, *([side] if side else []), f"{asked:g}{unit}", solution.strength]
     return "_".join(words)

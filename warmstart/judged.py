@@ -2,22 +2,88 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import mujoco
 import numpy as np
 
-from sports import tennis
+from sports import table_tennis, tennis
+from sports.humanoid.body import Body
+from sports.humanoid.mjcf import build_model
+from sports.rackets import Game
+from sports.scene import Scene
 from warmstart import shot, thrown
 from warmstart.solution import Solution
 from warmstart.strike import Moment, Rules
 
-
-def _tennis(solution: Solution, found: Moment) -> dict[str, float]:
-    scene = tennis.scene(tennis.Tennis(), solution.body)
-    return shot.followed(tennis.GAME, scene, solution, found)
+Checks = dict[str, tuple[str, float, str]]
+_RECORDED = ("recorded", float("nan"))
 
 
-def _tennis_played(solution: Solution, engine: str) -> dict[str, float]:
-    scene = tennis.scene(tennis.Tennis(), solution.body)
-    return shot.played(tennis.GAME, scene, solution, engine)
+def _tennis(body: Body) -> Scene:
+    return tennis.scene(tennis.Tennis(), body)
+
+
+def _table_tennis(body: Body) -> Scene:
+    return table_tennis.scene(table_tennis.TableTennis(), body)
+
+
+def _ball(off: float) -> Checks:
+    """Checks of a stroke whose planned ball may land ``off`` (m) its target."""
+    return {
+        "planned landing off target": ("<=", off, "m"),
+        "planned over the net": (">=", 0.0, "m"),
+        **{
+            f"replay in {engine}: {name}": (*_RECORDED, unit)
+            for engine in ("mujoco", "drake")
+            for name, unit in (
+                ("landing off target", "m"),
+                ("over the net", "m"),
+                ("ball: speed", "m/s"),
+                ("ball: landing off target", "m"),
+                ("ball: over the net", "m"),
+            )
+        },
+    }
+
+
+def _strokes(
+    game: Game,
+    scene: Callable[[Body], Scene],
+    checks: Checks,
+    also: Callable[[Solution], dict[str, float]] | None = None,
+) -> Rules:
+    """Rules of a racket sport."""
+    return Rules(
+        "ball_speed",
+        "m/s",
+        nearest=True,
+        follow=lambda solution, found: shot.followed(game, scene(solution.body), solution, found),
+        play=lambda solution, engine: shot.played(game, scene(solution.body), solution, engine),
+        checks=checks,
+        also=also,
+    )
+
+
+def depth_in(solution: Solution, scene: Scene, name: str, rate: float = 240.0) -> float:
+    """How deep (m) the planned athlete reaches into an object of a scene at most, by MuJoCo."""
+    model = build_model(scene)
+    data = mujoco.MjData(model)
+    body = model.body(name).id
+    data.qpos[:] = scene.default_qpos()
+    times = np.arange(0.0, solution.duration, 1.0 / rate)
+    deepest = 0.0
+    for row in solution.sample(solution.times[0] + times)["qpos"]:
+        data.qpos[scene.agent_qpos(0)] = row
+        mujoco.mj_fwdPosition(model, data)
+        for contact in data.contact:
+            if body in model.geom_bodyid[contact.geom]:
+                deepest = max(deepest, -float(contact.dist))
+    return deepest
+
+
+def _over_the_table(solution: Solution) -> dict[str, float]:
+    return {"planned depth in the table": depth_in(solution, _table_tennis(solution.body), "table")}
 
 
 def _javelin(solution: Solution, found: Moment) -> dict[str, float]:
@@ -28,29 +94,24 @@ def _javelin(solution: Solution, found: Moment) -> dict[str, float]:
     }
 
 
-_THROWN: dict[str, tuple[str, float, str]] = {
-    f"{head}{name}": ("recorded", float("nan"), "m")
-    for head in ("planned ", "replay in mujoco: ", "replay in drake: ")
-    for name in ("height", "distance")
-}
-_BALL: dict[str, tuple[str, float, str]] = {
-    "planned landing off target": ("<=", 0.5, "m"),
-    "planned over the net": (">=", 0.0, "m"),
-    **{
-        f"replay in {engine}: {name}": ("recorded", float("nan"), unit)
-        for engine in ("mujoco", "drake")
-        for name, unit in (
-            ("landing off target", "m"),
-            ("over the net", "m"),
-            ("ball: speed", "m/s"),
-            ("ball: landing off target", "m"),
-            ("ball: over the net", "m"),
-        )
-    },
-}
-
 RULES: dict[str, Rules] = {
-    "javelin": Rules("release_speed", "m/s", False, _javelin, None, _THROWN),
-    "tennis": Rules("ball_speed", "m/s", True, _tennis, _tennis_played, _BALL),
+    "javelin": Rules(
+        "release_speed",
+        "m/s",
+        nearest=False,
+        follow=_javelin,
+        checks={
+            f"{head}{name}": (*_RECORDED, "m")
+            for head in ("planned ", "replay in mujoco: ", "replay in drake: ")
+            for name in ("height", "distance")
+        },
+    ),
+    "table_tennis": _strokes(
+        table_tennis.GAME,
+        _table_tennis,
+        _ball(0.1) | {"planned depth in the table": ("<=", 0.002, "m")},
+        _over_the_table,
+    ),
+    "tennis": _strokes(tennis.GAME, _tennis, _ball(0.5)),
 }
 """By problem."""

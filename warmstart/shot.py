@@ -264,7 +264,9 @@ def stroke_to(
             "ask for another speed or target"
         )
     n, velocity, struck = strike(best)
-    landed, over = ball_after(game, struck)
+    after = ball_after(game, struck)
+    assert after is not None  # it lands at the target
+    landed, over = after
     if over < 0.0:
         raise ValueError(
             f"a ball of {speed:g} m/s to ({target[0]:g}, {target[1]:g}) goes into the net "

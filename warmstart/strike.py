@@ -86,7 +86,7 @@ def moment(
     time = at
     if nearest:
         low, high = max(at - AROUND, times[near[0]]), min(at + AROUND, times[near[-1]])
-        fine = np.linspace(low, high, 1 + round((high - low) / FINE))
+        fine = np.linspace(low, high, 1 + round(float(high - low) / FINE))
         apart = np.linalg.norm(path(fine) - np.array(event["place"]), axis=1)
         time = float(fine[int(apart.argmin())])
     q = attitude(time) / np.linalg.norm(attitude(time))
@@ -105,7 +105,7 @@ def moment(
 class Rules:
     """How a problem's strike or throw is judged."""
 
-    field: str
+    outcome: str
     """Key of the outcome in ``Solution.asked``."""
     unit: str
     nearest: bool
@@ -114,6 +114,8 @@ class Rules:
     """What comes of a moment beyond the hand, by name; ``outcome`` among it."""
     play: Callable[[Solution, str], dict[str, float]] | None = None
     """Figures of a replay in an engine with the real ball."""
+    also: Callable[[Solution], dict[str, float]] | None = None
+    """Figures of the whole planned motion."""
     checks: Mapping[str, tuple[str, float, str]] = field(default_factory=dict)
     """Checks of what ``follow`` and ``play`` find: sense, limit, unit."""
 
@@ -153,6 +155,7 @@ def planned(rules: Rules, solution: Solution, times: np.ndarray) -> dict[str, fl
         "planned direction off": found.angle_off(event),
         "planned face off": found.face_off(event),
         **_followed(rules, solution, found, "planned "),
+        **(rules.also(solution) if rules.also is not None else {}),
     }
 
 

@@ -78,6 +78,14 @@ PROBLEMS: dict[str, Problem] = {
             module="warmstart.problems.tennis",
         ),
         Problem(
+            name="table_tennis",
+            summary="forehand or backhand that returns a machine's ball to a spot on the table",
+            outcome="ball_speed",
+            unit="m/s",
+            sweep=(6.0, 7.0, 8.0),
+            module="warmstart.problems.table_tennis",
+        ),
+        Problem(
             name="javelin",
             summary="throw from a stand at a given release speed, angle and height",
             outcome="release_speed",

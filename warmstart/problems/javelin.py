@@ -76,10 +76,16 @@ def make_event(config: Config) -> striker.Event:
     """What the hand must do at the release."""
     a = math.radians(config.angle)
     forward = (math.cos(a), 0.0, math.sin(a))
-    velocity = tuple(config.release_speed * x for x in forward)
-    place = (0.0, 0.0, config.height)
     return striker.Event(
-        LINK, GRIP, NOSE, place, velocity, forward, fixed=(2,), spin=SPIN, straight=STRAIGHT
+        LINK,
+        GRIP,
+        NOSE,
+        (0.0, 0.0, config.height),
+        (config.release_speed * forward[0], 0.0, config.release_speed * forward[2]),
+        forward,
+        fixed=(2,),
+        spin=SPIN,
+        straight=STRAIGHT,
     )
 
 

@@ -107,7 +107,7 @@ COMFORT = {
 TOOL_ROOM = 0.04
 """What is held keeps this far (m) off the body at knots: it moves 0.4 m between two of them."""
 CORNERS = 0.03
-"""How far (m) the corners of the head stick out of its balls."""
+"""How far (m) the corners of head and pelvis stick out of their balls."""
 PRICE = 4e-3
 """Cost of a squared radian off :data:`COMFORT` at one knot."""
 
@@ -272,7 +272,7 @@ def transcribe(
     everywhere = np.arange(program.K)
     stance(program, body, *feet)
     arms_off(program, body, everywhere)
-    loaded = np.array([k for k in everywhere if program.model_at(k) is model])
+    loaded = np.array([k for k in everywhere if program.model_at(int(k)) is model])
     if tool:
         tool_off(program, body, tool, loaded)
     wanted = {model.index(name): angle for name, angle in COMFORT.items() if name in model.names}
@@ -369,6 +369,8 @@ def arms_off(program: Transcription, body: Body, knots) -> None:
         pairs += [(a, b) for a in arms[side] for b in beyond]
     head = [replace(b, radius=b.radius + CORNERS / 2) for b in axis_balls(body, "Head")]
     pairs += [(a, b) for s in "LR" for a in axis_balls(body, f"{s}_Shoulder", 3)[1:] for b in head]
+    hips = [replace(b, radius=b.radius + CORNERS) for b in axis_balls(body, "Pelvis")]
+    pairs += [(_end(body, f"{s}_Wrist"), b) for s in "LR" for b in hips]
     waist = [_end(body, link) for link in ("Torso", "Spine")]
     pairs += [(a, b) for s in "LR" for a in axis_balls(body, f"{s}_Shoulder", 3)[1:] for b in waist]
     pairs += [(axis_balls(body, "L_Knee")[0], axis_balls(body, "R_Knee")[0])]
@@ -405,8 +407,8 @@ def key_guess(program: Transcription, name: str, durations: Sequence[float]) -> 
     times = [float(row.pop("time")) for row in rows]
     frames = [{k: float(v) for k, v in row.items() if k in program.model.names} for row in rows]
     at = program.nominal_times(durations)
-    event = at[program.knots("swing")[-1]]
-    seconds = np.interp(times, (0.0, 1.0, 2.0), (0.0, event, at[-1]))
+    event = float(at[program.knots("swing")[-1]])
+    seconds = np.interp(times, (0.0, 1.0, 2.0), np.array([0.0, event, at[-1]])).tolist()
     return program.guess(jumper.key_frames(program.model, seconds, frames, at), durations)
 
 
