@@ -26,7 +26,7 @@ from warmstart.replay import replay_states
 from warmstart.solution import Solution
 from warmstart.strike import Moment
 
-STEP = 1 / 1000
+STEP = 1 / 400
 """Step of a flight (s); the law's Runge-Kutta of order 4."""
 LONGEST = 4.0
 """No flight here lasts longer (s)."""
@@ -254,7 +254,12 @@ def stroke_to(
     best = None
     for elevation in (0.0, 0.15, 0.3):
         found = least_squares(
-            miss, [elevation, 0.0, 0.6 * speed], diff_step=1e-5, xtol=1e-12, ftol=1e-14
+            miss,
+            [elevation, 0.0, 0.6 * speed],
+            diff_step=1e-5,
+            xtol=1e-12,
+            ftol=1e-14,
+            max_nfev=20,
         )
         if np.abs(found.fun).max() < 1e-3 and (best is None or found.x[0] < best[0]):
             best = found.x

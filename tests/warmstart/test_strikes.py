@@ -100,9 +100,9 @@ def test_a_stroke_lands_on_its_target_by_the_compiled_law(racket):
 
 
 def test_a_mirrored_target_asks_for_the_mirrored_stroke(racket):
-    """With a racket that is the same on both sides of its middle plane."""
+    """With a racket that is the same on all sides of the contact; a real one has a handle."""
     tool = racket.copy()
-    tool[1], tool[3], tool[7:] = 0.0, 0.0, 0.0
+    tool[1:4], tool[4:7], tool[7:] = (0.0, -0.35, 0.0), 100.0, 0.0
     point = np.array([0.0, -0.35, -0.01])
     strokes = []
     for side in (1.0, -1.0):
@@ -137,15 +137,20 @@ def test_a_throw_in_a_vacuum_is_the_parabola(angle):
     fall = height - JAVELIN_RADIUS
     flight = (v * np.sin(a) + np.sqrt((v * np.sin(a)) ** 2 + 2 * G * fall)) / G
     expected = 0.2 + v * np.cos(a) * flight - LINE_X
-    found = thrown.distance(place, velocity, nose, drag=False)
-    assert abs(found - expected) <= END + 1e-6  # which end is meant is the sign of zero
-    up = np.array([np.cos(1e-6), 0.0, np.sin(1e-6)])
-    assert thrown.distance(place, velocity, up, drag=False) == pytest.approx(
-        expected - END, abs=1e-4
-    )
-    assert thrown.distance(place, velocity, velocity / v) < thrown.distance(
-        place, velocity, velocity / v, drag=False
-    )
+    up = np.array([np.cos(1e-6), 0.0, np.sin(1e-6)])  # the tail comes down first
+    found = thrown.distance(place, velocity, up, drag=False)
+    assert found == pytest.approx(expected - END, abs=1e-4)
+    assert thrown.distance(place, velocity, nose, drag=False) == pytest.approx(expected, abs=1e-6)
+
+
+def test_drag_takes_energy_from_a_javelin_that_flies_along_itself():
+    """Thrown straight down along its axis only the drag along it acts: a hair's breadth less far
+    than in a vacuum, on a way that leans by one degree."""
+    lean = np.radians(1.0)
+    nose = np.array([np.sin(lean), 0.0, -np.cos(lean)])
+    place = np.array([0.0, 0.0, 50.0])
+    free = thrown.distance(place, 30.0 * nose, nose, drag=False)
+    assert free - 0.05 < thrown.distance(place, 30.0 * nose, nose) < free + 0.05
 
 
 def test_the_planned_javelin_lies_in_the_hand_like_the_held_one():
@@ -223,12 +228,15 @@ def test_the_motion_obeys_both_engines_at_every_knot(name, request):
     solution = request.getfixturevalue(name)
     weight = solution.body.mass * G
     effort = solution.body.array("effort")
+    names = ("qpos", "qvel", "qacc", "contact_force")
+    motion = {field: getattr(solution, field) for field in names}
+    load = solution.loaded(solution.times)[:, None]
     for compute in (inverse_dynamics_mujoco, inverse_dynamics_drake):
-        tau = needed(compute, solution, solution.times)
+        tau = load * compute(solution, motion, solution.body)
+        tau += (1 - load) * compute(solution, motion, solution.empty_handed)
         assert np.abs(tau[:, :6]).max() / weight < 1e-5
         np.testing.assert_allclose(tau[:, 6:], solution.torque, atol=1e-4)
     assert (np.abs(solution.torque) / effort).max() <= striker.SHARE + 1e-5
-    load = solution.loaded(solution.times)
     assert set(np.unique(np.round(load, 9))) == ({0.0, 1.0} if name == "throw" else {1.0})
 
 
@@ -283,8 +291,9 @@ def test_it_is_certified_and_says_what_it_achieved(name, request):
     assert name_of(solution).startswith(solution.problem)
 
 
-def test_a_spoiled_strike_is_refused(forehand):
-    """Another speed asked, no event, no ball, a light javelin: each fails by its own check."""
+def test_a_spoiled_strike_is_refused(forehand, monkeypatch):
+    """Another speed asked, no event, no ball, no replay: each fails by its own check."""
+    monkeypatch.setattr("warmstart.certificate._replay", lambda *_: {})
     event = dict(forehand.stats["event"])
     faster = event | {"velocity": [1.2 * v for v in event["velocity"]]}
     for stats, words in (
@@ -295,10 +304,13 @@ def test_a_spoiled_strike_is_refused(forehand):
         found = certify(replace(forehand, stats=stats))
         assert not found.passed
         assert any(words in f for f in found.failures)
+        assert any("replay in drake: miss" in f for f in found.failures)
     assert set(required("tennis")) > set(required("javelin")) & set(required("high_jump"))
 
 
-def test_a_javelin_that_is_never_let_go_is_refused(throw):
+def test_a_javelin_that_is_never_let_go_is_refused(throw, monkeypatch):
+    """The stored torques after the release are those of an empty hand."""
+    monkeypatch.setattr("warmstart.certificate._replay", lambda *_: {})
     kept = {k: v for k, v in throw.stats.items() if k != "payload"}
     failures = certify(replace(throw, stats=kept)).failures
     assert any(f.startswith("base force residual") for f in failures)
@@ -347,8 +359,8 @@ def test_impossible_options_are_one_sentence():
     for options, words in (
         ({"ball_speed": 99.0}, "ball_speed must lie between"),
         ({"side": "volley"}, "side must be"),
-        ({"target": (3.0, 0.0)}, "does not lie in the far court"),
-        ({"bounce": (1.0, 0.0)}, "does not lie in the near court"),
+        ({"target": (3.0, 0.0)}, "does not lie in the far half"),
+        ({"bounce": (-2.0, 0.0)}, "does not lie in the near half"),
         ({"brush": 2.0}, "brush must lie"),
         ({"machine_speed": 5.0}, "machine_speed must lie"),
         ({"detail": 9.0}, "detail must lie"),
