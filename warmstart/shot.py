@@ -71,22 +71,16 @@ def flown(law: str, ball: Ball, seconds: float) -> Ball:
     return Ball(ball.time + seconds, np.array(p), np.array(v), ball.angvel)
 
 
-def until(law: str, ball: Ball, axis: int, value: float) -> Ball | None:
-    """The ball when a coordinate of it first passes a value in its flight; None if it never does.
-
-    A ball that begins there is followed on.
-    """
+def until(law: str, ball: Ball, axis: int, value: float, sense: float) -> Ball | None:
+    """The ball when a coordinate first passes a value, rising (``sense`` 1) or falling (-1), in its
+    flight; None if it never does."""
     numbers, spin = ball_of(law).numbers(), tuple(ball.angvel)
-    p, v, begun = tuple(ball.pos), tuple(ball.linvel), ball.time
-    side = None
+    p, v = tuple(ball.pos), tuple(ball.linvel)
     for k in range(round(LONGEST / STEP)):
         q, u = flight.fly(p, v, spin, STEP, numbers)
-        if p[axis] != value:
-            side = p[axis] > value
-        if side is not None and (q[axis] > value) != side:
-            return _refined(
-                law, Ball(begun + k * STEP, np.array(p), np.array(v), ball.angvel), axis, value
-            )
+        if sense * p[axis] < sense * value <= sense * q[axis]:
+            begun = Ball(ball.time + k * STEP, np.array(p), np.array(v), ball.angvel)
+            return _refined(law, begun, axis, value)
         p, v = q, u
     return None
 
@@ -134,11 +128,12 @@ def incoming(
     )
     still = np.zeros(3)
     launched = Ball(0.0, np.array(start, float), velocity[0].double().numpy(), still)
-    down = until(game.law, launched, 2, court.height + radius)
+    down = until(game.law, launched, 2, court.height + radius, -1.0)
     if down is None or not down.pos[0] < x:
         raise ValueError(f"the machine's ball of {speed:g} m/s does not bounce before x = {x:g} m")
     up = bounced(game.law, down)
-    there, again = until(game.law, up, 0, x), until(game.law, up, 2, court.height + radius)
+    there = until(game.law, up, 0, x, 1.0)
+    again = until(game.law, up, 2, court.height + radius, -1.0)
     if there is None or (again is not None and again.time < there.time):
         raise ValueError(
             f"the machine's ball of {speed:g} m/s bounces twice before it comes to x = {x:g} m"
@@ -148,7 +143,7 @@ def incoming(
 
 def state_at(law: str, game: Game, launched: Ball, time: float) -> Ball:
     """The machine's ball some time after its launch, before or after its first bounce."""
-    down = until(law, launched, 2, game.court.height + game.radius)
+    down = until(law, launched, 2, game.court.height + game.radius, -1.0)
     if down is None or time <= down.time:
         return flown(law, launched, time) if time > 0.0 else launched
     return flown(law, bounced(law, down), time - down.time)
@@ -200,8 +195,8 @@ def impact(
 def ball_after(game: Game, struck: Ball) -> tuple[Ball, float] | None:
     """Where a struck ball lands, and by how much it clears the net (m); None if it does not come
     down or does not come to the net."""
-    landed = until(game.law, struck, 2, game.court.height + game.radius)
-    over = until(game.law, struck, 0, 0.0)
+    landed = until(game.law, struck, 2, game.court.height + game.radius, -1.0)
+    over = until(game.law, struck, 0, 0.0, -1.0)
     if landed is None or over is None:
         return None
     top = game.court.net_height + game.court.net_rise / game.court.net_half_width * abs(over.pos[1])

@@ -67,9 +67,11 @@ def test_the_machines_ball_is_the_one_of_the_compiled_law():
 
 def test_machines_balls_that_never_come_are_refused():
     with pytest.raises(ValueError, match="bounces twice"):
-        shot.incoming(GAME, START, 22.0, (9.0, 0.0), 16.0)
+        shot.incoming(GAME, START, 18.0, (5.0, 0.0), 16.0)
     with pytest.raises(ValueError, match="does not bounce before"):
         shot.incoming(GAME, START, 20.0, (7.5, 0.0), 6.0)
+    _, there = shot.incoming(GAME, START, 22.0, (9.0, 0.0), 12.5)  # bounces once, fast
+    assert there.pos[2] > 1.0
 
 
 @pytest.mark.parametrize("mass", [0.3, 1e9])
