@@ -20,7 +20,7 @@ from sports.humanoid.hold import JAVELIN_RADIUS
 from sports.javelin import END
 from warmstart.contact import Ball
 from warmstart.phases import Phase
-from warmstart.problems import jumper, striker
+from warmstart.problems import clearance, jumper, striker
 from warmstart.solution import Solution
 from warmstart.transcription import Transcription
 
@@ -113,7 +113,7 @@ def transcribe(
     )
     held = np.array([k for k in range(program.K) if program.model_at(k) is program.model])
     program.ground(ENDS, held, margin=0.05)
-    striker.shaft_off(program, body, event, JAVELIN_RADIUS, held)
+    clearance.shaft_off(program, body, event, JAVELIN_RADIUS, held)
     link, forward = program.model.tree.link(LINK), list(event.normal)
 
     def point(q, p):

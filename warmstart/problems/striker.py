@@ -25,9 +25,8 @@ from warmstart.contact import Ball
 from warmstart.nlp import Result
 from warmstart.outcome import link_poses
 from warmstart.phases import Bounds, Phase, Weights
-from warmstart.problems import jumper
+from warmstart.problems import clearance, jumper
 from warmstart.rigid_body import load_tree, reduce_tree
-from warmstart.separation import axis_balls
 from warmstart.solution import Solution
 from warmstart.transcription import Transcription
 
@@ -95,7 +94,6 @@ SHARE = 0.93
 more between two."""
 SHEAR = 150.0
 """Weight of the horizontal force on each foot."""
-TRUNK = ("Pelvis", "Torso", "Chest", "Head")
 COMFORT = {
     **dict.fromkeys(("pitch", "roll", "Torso_x", "Torso_y", "Chest_y"), 0.0),
     **{f"{side}_Hip_{axis}": 0.0 for side in "LR" for axis in "xz"},
@@ -104,10 +102,6 @@ COMFORT = {
     "L_Elbow_z": -1.0,
 }
 """Angles (rad) to which a small price draws the posture: upright, and an idle arm at rest."""
-TOOL_ROOM = 0.04
-"""What is held keeps this far (m) off the body at knots: it moves 0.4 m between two of them."""
-CORNERS = 0.03
-"""How far (m) the corners of head and pelvis stick out of their balls."""
 PRICE = 4e-3
 """Cost of a squared radian off :data:`COMFORT` at one knot."""
 
@@ -271,10 +265,10 @@ def transcribe(
     rest(program)
     everywhere = np.arange(program.K)
     stance(program, body, *feet)
-    arms_off(program, body, everywhere)
+    clearance.arms_off(program, body, everywhere)
     loaded = np.array([k for k in everywhere if program.model_at(int(k)) is model])
     if tool:
-        tool_off(program, body, tool, loaded)
+        clearance.tool_off(program, body, tool, loaded)
     wanted = {model.index(name): angle for name, angle in COMFORT.items() if name in model.names}
     where, angles = list(wanted), ca.DM(list(wanted.values()))
     program.cost(
@@ -311,88 +305,6 @@ def stance(
         ]
 
     program.rows("stance", [0], feet)
-
-
-def _end(body: Body, link: str) -> Ball:
-    return axis_balls(body, link)[-1]
-
-
-def _forearm(body: Body, side: str) -> list[Ball]:
-    return [*axis_balls(body, f"{side}_Elbow", 3), _end(body, f"{side}_Hand")]
-
-
-def obstacles(body: Body) -> list[Ball]:
-    """What a thing in the right hand can meet: trunk, head, upper arms, left arm, thighs."""
-    return [
-        *(_end(body, link) for link in TRUNK),
-        *(replace(b, radius=b.radius + CORNERS) for b in axis_balls(body, "Head")),
-        *_forearm(body, "L")[1:],
-        *(b for s in "LR" for b in axis_balls(body, f"{s}_Hip", 3)),
-        *(b for s in "LR" for b in axis_balls(body, f"{s}_Shoulder", 3)[1:]),
-    ]
-
-
-def tool_off(program: Transcription, body: Body, tool: Sequence[Ball], knots) -> None:
-    """What is held, as balls, stays off the body."""
-    keep_off(program, [(a, b) for a in tool for b in obstacles(body)], knots, TOOL_ROOM)
-
-
-def shaft_off(
-    program: Transcription, body: Body, event: Event, radius: float, knots, room: float = TOOL_ROOM
-) -> None:
-    """A long shaft of a ``radius`` (m), along the event's axis through its point, stays off the
-    body: the distance of balls from a line."""
-    model = program.model
-    link = model.tree.link(event.link)
-
-    def off(q, p):
-        motion = model.motion(q)
-        along = motion.R_WL[link] @ ca.DM(list(event.axis))
-        through = motion.point(link, event.point)
-        gaps = []
-        for b in obstacles(body):
-            to = motion.point(model.tree.link(b.link), b.center) - through
-            gaps.append(ca.sumsqr(to) - ca.dot(to, along) ** 2 - (b.radius + radius + room) ** 2)
-        return [("shaft apart", ca.vertcat(*gaps) / 0.05, 0.0, np.inf)]
-
-    program.rows("shaft off", knots, off)
-
-
-def arms_off(program: Transcription, body: Body, knots) -> None:
-    """Arms stay off trunk, head and each other; knees off each other."""
-    arms = {s: _forearm(body, s) for s in "LR"}
-    trunk = [_end(body, link) for link in TRUNK]
-    pairs = [(a, b) for s in "LR" for a in arms[s][1:] for b in trunk]
-    pairs += [(a, b) for a in arms["L"] for b in arms["R"]]
-    for side, other in ("LR", "RL"):  # an arm across the chest
-        beyond = [_end(body, f"{other}_Thorax"), *axis_balls(body, f"{other}_Shoulder")]
-        pairs += [(a, b) for a in arms[side] for b in beyond]
-    head = [replace(b, radius=b.radius + CORNERS / 2) for b in axis_balls(body, "Head")]
-    pairs += [(a, b) for s in "LR" for a in axis_balls(body, f"{s}_Shoulder", 3)[1:] for b in head]
-    hips = [replace(b, radius=b.radius + CORNERS) for b in axis_balls(body, "Pelvis")]
-    pairs += [(_end(body, f"{s}_Wrist"), b) for s in "LR" for b in hips]
-    waist = [_end(body, link) for link in ("Torso", "Spine")]
-    pairs += [(a, b) for s in "LR" for a in axis_balls(body, f"{s}_Shoulder", 3)[1:] for b in waist]
-    pairs += [(axis_balls(body, "L_Knee")[0], axis_balls(body, "R_Knee")[0])]
-    keep_off(program, pairs, knots)
-
-
-def keep_off(
-    program: Transcription, pairs: Sequence[tuple[Ball, Ball]], knots, margin: float = 0.0
-) -> None:
-    """The two balls of every pair stay ``margin`` (m) apart."""
-    model = program.model
-
-    def off(q, p):
-        motion = model.motion(q)
-
-        def at(ball: Ball):
-            return motion.point(model.tree.link(ball.link), ball.center)
-
-        gaps = [ca.sumsqr(at(a) - at(b)) - (a.radius + b.radius + margin) ** 2 for a, b in pairs]
-        return [("apart", ca.vertcat(*gaps) / 0.05, 0.0, np.inf)]
-
-    program.rows("keep off", knots, off)
 
 
 def key_guess(program: Transcription, name: str, durations: Sequence[float]) -> np.ndarray:
