@@ -7,7 +7,7 @@ before its end, the legs before it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -16,7 +16,7 @@ from sports import table_tennis
 from sports.humanoid.body import Body
 from sports.scene import Scene
 from warmstart.contact import Ball
-from warmstart.problems import racket
+from warmstart.problems import clearance, racket
 from warmstart.separation import axis_balls
 from warmstart.solution import Solution
 from warmstart.transcription import Transcription
@@ -91,7 +91,11 @@ def off_the_table(program: Transcription, aimed: racket.Aim) -> None:
         short = [end - at(b)[0] - b.radius for b in before]
         return [("off the table", ca.vertcat(*over, *short) / 0.1, 0.0, np.inf)]
 
-    program.rows("table", np.arange(program.K), clear)
+    everywhere = np.arange(program.K)
+    program.rows("table", everywhere, clear)
+    hips = [replace(b, radius=b.radius + clearance.CORNERS) for b in axis_balls(body, "Pelvis")]
+    arm = axis_balls(body, "L_Elbow", 3)[1:]  # it hangs, kept back by the table
+    clearance.keep_off(program, [(a, b) for a in arm for b in hips], everywhere)
 
 
 def solve(
