@@ -69,6 +69,14 @@ PROBLEMS: dict[str, Problem] = {
             sweep=(3.0, 5.0, 7.0),
             module="warmstart.problems.long_jump",
         ),
+        Problem(
+            name="hurdling",
+            summary="one stride over a hurdle of given height at a given run speed",
+            outcome="hurdle_height",
+            unit="m",
+            sweep=(0.762, 0.838, 0.914, 0.991, 1.067),
+            module="warmstart.problems.hurdling",
+        ),
     )
 }
 
