@@ -52,22 +52,13 @@ def axis_balls(body: Body, link: str, count: int = 2) -> list[Ball]:
     return [Ball(link, (float(p[0]), float(p[1]), float(p[2])), radius) for p in points]
 
 
-def keep_apart(
-    program: Transcription,
-    body: Body,
-    knots: Sequence[int] | np.ndarray,
-    forearms: bool = False,
-) -> None:
-    """Adds the rows at knots: legs and hands on their sides, hands off the legs (50 a knot).
-
-    With ``forearms`` these keep off the legs too: a leg spread to its side comes up to them.
-    """
+def keep_apart(program: Transcription, body: Body, knots: Sequence[int] | np.ndarray) -> None:
+    """Adds the rows at knots: legs and hands on their sides, hands off the legs (50 a knot)."""
     import casadi as ca
 
     model = program.model
     hands = {s: [axis_balls(body, f"{s}_{n}")[-1] for n in HAND] for s in "LR"}
     own = {s: [b for n in LEG for b in axis_balls(body, f"{s}_{n}")] + hands[s] for s in "LR"}
-    off_legs = {s: hands[s] + (axis_balls(body, f"{s}_Elbow") if forearms else []) for s in "LR"}
     # The upper end of a shin is covered by the thigh.
     lifted = {
         s: axis_balls(body, f"{s}_Hip", 3)
@@ -94,7 +85,7 @@ def keep_apart(
         motion = model.motion(q)
         gaps = []
         for side in "LR":
-            for a in off_legs[side]:
+            for a in hands[side]:
                 for b in lifted[side]:
                     corners = CORNERS * (2 if b.link.endswith(("Ankle", "Toe")) else 1)
                     reach = a.radius + b.radius + corners - ALLOWED

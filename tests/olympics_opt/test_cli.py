@@ -161,7 +161,7 @@ def test_list_as_json(capsys):
     assert (jump["body"], jump["agents"], jump["act"]) == ("smpl", 1, 69)
     assert jump["obs"] == 358 + 6  # sports page: proprioception and goal features
     assert jump["metrics"]["height"] == "m"
-    assert {p["name"] for p in found["problems"]} == {"high_jump", "long_jump"}
+    assert {p["name"] for p in found["problems"]} == {"high_jump", "long_jump", "hurdling"}
     for policy in found["pretrained"]:
         assert Path(policy["path"]).is_file()
 
