@@ -1,7 +1,8 @@
 """From a solution to a demonstration: certified, tracked in MuJoCo, labelled with what it achieved.
 
 This is what made the shipped clips: ``python -m warmstart.demonstration SOLUTION.npz... --out DIR``
-writes, for each solution that passes, ``PROBLEM_ASKED_STRENGTH.npz`` and its certificate beside it.
+writes, for each solution that passes, ``PROBLEM_ASKED_STRENGTH[_STYLE].npz`` and its certificate
+beside it.
 """
 
 from __future__ import annotations
@@ -96,6 +97,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{path}: {error}", file=sys.stderr)
             return 2
         name = f"{solution.problem}_{asked:g}m_{solution.strength}"
+        if solution.stats.get("style", "tuck") != "tuck":
+            name += f"_{solution.stats['style']}"
         if found.passed:
             out = options.out
             save_demonstration(found, out / f"{name}.npz", out / f"{name}.json")

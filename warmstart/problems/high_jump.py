@@ -223,4 +223,5 @@ def solve(
         solve_s=sum(r.solve_s for r in results),
         cpu_s=sum(r.cpu_s for r in results),
     )
-    return program.solution("high_jump", {"bar_height": config.bar_height}, total)
+    asked = {"bar_height": config.bar_height}
+    return program.solution("high_jump", asked, total, style=config.style)
