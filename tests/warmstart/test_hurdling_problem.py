@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -115,14 +116,15 @@ def test_the_mirrored_problem_has_the_mirrored_solution(stride):
 
 
 def test_impossible_options_are_one_sentence():
-    for wrong, words in (
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({"hurdle_height": 2.0}, r"hurdle_height must lie between 0\.3 and 1\.2 m, not 2\.0"),
         ({"run_speed": 15.0}, r"run_speed must lie between 3 and 10 m/s, not 15"),
         ({"speed_loss": 0.0}, "speed_loss must lie between"),
         ({"clearance": -0.1}, "clearance must lie between"),
         ({"lead": "both"}, "lead must be right or left, not both"),
         ({"detail": 9.0}, "detail must lie between"),
-    ):
+    )
+    for wrong, words in cases:
         with pytest.raises(ValueError, match=words) as found:
             hurdling.Config(**wrong)
         assert "\n" not in str(found.value)

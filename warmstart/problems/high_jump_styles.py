@@ -177,6 +177,8 @@ def _flop(program: Transcription) -> None:
     """Back to the bar, head beyond it and feet before it, hips extended; on the back at the end."""
     body, model, tree = program.body, program.model, program.model.tree
     balls = [b for b in outline(body) if not b.link.endswith(("Ankle", "Toe"))]
+    soles = [b for side in "LR" for b in jumper.foot(body, side)]
+    chest = body.links[body.link_index("Chest")].shapes[0]
 
     def arch(q, p):
         motion = model.motion(q)
@@ -190,14 +192,13 @@ def _flop(program: Transcription) -> None:
 
     def land(q, p):
         motion = model.motion(q)
-        back = motion.point(
-            tree.link("Chest"), body.links[body.link_index("Chest")].shapes[0].center
-        )
-        radius = body.links[body.link_index("Chest")].shapes[0].size[0]
+        back = motion.point(tree.link("Chest"), chest.center)
+        feet = [motion.point(tree.link(b.link), b.center)[0] for b in soles]
         return [
-            ("back down", back[2] - radius, 0.0, 0.05),
-            ("chest up at the landing", motion.R_WL[tree.link("Chest")][2, 0], 0.7, np.inf),
+            ("back down", back[2] - chest.size[0], 0.0, 0.05),
+            ("chest up at the landing", motion.R_WL[tree.link("Chest")][2, 0], 0.85, np.inf),
             ("root beyond the bar", q[0], BAR_X + 0.35, np.inf),
+            ("feet beyond the bar", ca.vertcat(*feet), BAR_X + 0.15, np.inf),
         ]
 
     middle = program.knots("fall")[0]
