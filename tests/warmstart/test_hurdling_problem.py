@@ -21,13 +21,13 @@ from warmstart.problems import Infeasible, hurdling, jumper
 from warmstart.solution import Solution
 
 BODY = load_body("smpl")
-EASY = hurdling.Config(hurdle_height=0.762, run_speed=5.5, detail=0.4)
+COARSE = hurdling.Config(detail=0.5)
 
 
 @pytest.fixture(scope="module")
 def stride() -> Solution:
-    """A coarse stride over a hurdle of 0.762 m, solved from nothing."""
-    solution = hurdling.solve(EASY)
+    """A coarse stride over a hurdle of 1.067 m, solved from nothing."""
+    solution = hurdling.solve(COARSE)
     print(jumper.shown(solution))
     return solution
 
@@ -99,7 +99,7 @@ def test_speed_is_the_asked_one_before_and_kept_after(stride):
 def test_the_mirrored_problem_has_the_mirrored_solution(stride):
     """The left leg leads, solved from nothing: the same motion in a mirror, but for the few mm by
     which the body's halves differ."""
-    other = hurdling.solve(replace(EASY, lead="left"))
+    other = hurdling.solve(replace(COARSE, lead="left"))
     cost = other.stats["objective"] / stride.stats["objective"]
     share = np.linspace(0.0, 1.0, 41)
     rows = []
