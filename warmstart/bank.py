@@ -23,7 +23,7 @@ from warmstart.outcome import lowest
 from warmstart.problems import get_problem
 
 DATA = "data"
-CONTEXT = {"high_jump": ("bar_height",)}
+CONTEXT = {"high_jump": ("bar_height",), "hurdling": ("hurdle_height",)}
 """Labels of a clip that its task understands as context of a start, by task."""
 
 

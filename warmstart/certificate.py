@@ -87,6 +87,11 @@ PROBLEM_LIMITS: dict[str, dict[str, tuple[str, float, str]]] = {
         "touch-down: energy gained": ("<=", 0.0, "J"),
         "touch-down: upward speed gained": ("<=", 0.81, "m/s"),
     },
+    "hurdling": {
+        "clearance over the hurdle": (">=", 0.0, "m"),
+        "landing beyond the hurdle": (">=", 0.3, "m"),
+        "speed at the landing": (">=", 0.9, "of the run's"),
+    },
 }
 
 

@@ -1,7 +1,8 @@
 """From a solution to a demonstration: certified, tracked in MuJoCo, labelled with what it achieved.
 
 This is what made the shipped clips: ``python -m warmstart.demonstration SOLUTION.npz... --out DIR``
-writes, for each solution that passes, ``PROBLEM_ASKED_STRENGTH.npz`` and its certificate beside it.
+writes, for each solution that passes, ``PROBLEM_ASKED_STRENGTH[_STYLE].npz`` and its certificate
+beside it.
 """
 
 from __future__ import annotations
@@ -123,12 +124,14 @@ def strike_clip(solution: Solution, certificate: Certificate, fps: float = 60.0)
 
 
 def name_of(solution: Solution) -> str:
-    """Of a demonstration's file: problem, the side of a stroke, outcome, strength."""
+    """Of a demonstration's file: problem, side of a stroke, outcome, strength, style of a jump."""
     problem, side = solution.problem, solution.stats.get("options", {}).get("side")
     rules = RULES.get(problem)
     asked = solution.asked[rules.outcome if rules else OUTCOMES[problem].field]
     unit = rules.unit.replace("/", "p") if rules else "m"
     words = [problem, *([side] if side else []), f"{asked:g}{unit}", solution.strength]
+    if solution.stats.get("style", "tuck") != "tuck":
+        words.append(solution.stats["style"])
     return "_".join(words)
 
 

@@ -12,14 +12,17 @@ import mujoco
 import numpy as np
 import torch
 
-from sports import high_jump, long_jump
+from sports import high_jump, hurdling, long_jump
 from sports.humanoid.body import Body
 from sports.humanoid.mjcf import build_model
 from sports.physics.base import Geometry
+from sports.scene import Scene
 from warmstart import rotation
 
 TOUCH = 0.005
 """A support point this close to the ground (m) touches it; one that carries load has sunk in."""
+KEPT = 0.9
+"""A hurdle is cleared at speed if this share of the run's is left at the landing."""
 FLIGHT = 0.005
 """Without a support point below this height (m) the athlete flies."""
 
@@ -34,6 +37,13 @@ class Outcome:
     """(body, times (T,), qpos (T, 7 + n)) -> outcome (m); NaN without a legal attempt."""
     rules: Callable[[Body, np.ndarray, np.ndarray, dict[str, float]], dict[str, float]]
     """(body, times, qpos, asked) -> figures of the problem's own checks."""
+    judge: Callable[[Body, np.ndarray, np.ndarray, dict[str, float]], dict[str, float]] | None = (
+        None
+    )
+    """The same -> ``success`` and other metrics of a tracked motion whose task decides something
+    else (one hurdle is no race); None where the task's own rules decide."""
+    after: int = 12
+    """Control steps beyond the motion in which it is decided, at most."""
 
 
 def link_poses(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -67,39 +77,60 @@ def lowest(body: Body, qpos: np.ndarray) -> np.ndarray:
     return (points[..., 2] - radii).min(1)
 
 
-class _Bar:
-    """Distance between the athlete and a bar of any height, by MuJoCo's collision routines."""
+class _Obstacle:
+    """Distance between the athlete and a bar or hurdle of any height, by MuJoCo's collisions.
 
-    def __init__(self, body: Body) -> None:
-        scene = high_jump.scene(high_jump.HighJump(bar_height=1.0), body)
+    The obstacle stays where its scene has it; the athlete is moved up or down instead.
+    """
+
+    def __init__(self, scene: Scene, name: str, top: float) -> None:
         self.model = build_model(scene)
         self.data = mujoco.MjData(self.model)
-        self.at = scene.object_qpos("bar").start
         self.data.qpos[:] = scene.default_qpos()
-        self.agent = scene.agent_qpos(0)
-        root = self.model.body(f"agent0/{body.links[0].name}").id
+        self.agent, self.top = scene.agent_qpos(0), top
+        root = self.model.body(f"agent0/{scene.body.links[0].name}").id
         mine = self.model.body_rootid[self.model.geom_bodyid] == root
         self.geoms = np.flatnonzero(mine)
-        self.bar = int(self.model.body("bar").geomadr[0])
+        self.geom = int(self.model.body(name).geomadr[0])
 
     def gap(self, qpos: np.ndarray, height: float, enough: float = 1.0) -> float:
-        """Smallest signed distance (m) of any frame to a bar whose top is at ``height``; at most
-        ``enough``."""
-        self.data.qpos[self.at : self.at + 3] = (
-            high_jump.BAR_X,
-            high_jump.BAR_Y,
-            height - high_jump.BAR_RADIUS,
-        )
+        """Smallest signed distance (m) of any frame to an obstacle whose top is at ``height``; at
+        most ``enough``."""
         best = enough
         for row in qpos:
             self.data.qpos[self.agent] = row
+            self.data.qpos[self.agent.start + 2] += self.top - height
             mujoco.mj_kinematics(self.model, self.data)
             for geom in self.geoms:
                 found = mujoco.mj_geomDistance(
-                    self.model, self.data, int(geom), self.bar, best, None
+                    self.model, self.data, int(geom), self.geom, best, None
                 )
                 best = min(best, found)
         return best
+
+    def cleared(self, qpos: np.ndarray) -> float:
+        """Top (m, to 2 mm) of the highest one that no frame touches; NaN below 0.1 m."""
+        low, high = 0.1, None
+        for height in np.arange(low, 3.2, 0.15):
+            if self.gap(qpos, float(height), 0.05) < 0.0:
+                high = float(height)
+                break
+            low = float(height)
+        if high is None or high <= 0.1:
+            return float("nan")
+        while high - low > 0.002:
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if self.gap(qpos, middle, 0.05) < 0.0 else (middle, high)
+        return low
+
+
+def _bar(body: Body) -> _Obstacle:
+    return _Obstacle(high_jump.scene(high_jump.HighJump(bar_height=1.0), body), "bar", 1.0)
+
+
+def _hurdle(body: Body) -> _Obstacle:
+    config = hurdling.Hurdling(height=hurdling.RACE_HEIGHT)
+    return _Obstacle(hurdling.scene(config, body), "hurdle0", hurdling.RACE_HEIGHT)
 
 
 def cleared_height(body: Body, times: np.ndarray, qpos: np.ndarray) -> float:
@@ -111,19 +142,7 @@ def cleared_height(body: Body, times: np.ndarray, qpos: np.ndarray) -> float:
     crossing = np.flatnonzero((x[:-1] < high_jump.BAR_X) & (x[1:] >= high_jump.BAR_X))
     if not crossing.size or abs(qpos[crossing[0], 1] - high_jump.BAR_Y) > high_jump.HALF_GAP:
         return float("nan")
-    near = qpos[np.abs(x - high_jump.BAR_X) < 1.5]
-    bar, low, high = _Bar(body), 0.1, None
-    for height in np.arange(low, 3.2, 0.15):
-        if bar.gap(near, float(height), 0.05) < 0.0:
-            high = float(height)
-            break
-        low = float(height)
-    if high is None or high <= 0.1:
-        return float("nan")
-    while high - low > 0.002:
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if bar.gap(near, middle, 0.05) < 0.0 else (middle, high)
-    return low
+    return _bar(body).cleared(qpos[np.abs(x - high_jump.BAR_X) < 1.5])
 
 
 def _bar_rules(
@@ -137,7 +156,7 @@ def _bar_rules(
         return {}
     if z[over].min() < height:
         return {}
-    return {"clearance over the bar": _Bar(body).gap(qpos, height, 0.5)}
+    return {"clearance over the bar": _bar(body).gap(qpos, height, 0.5)}
 
 
 def _flight(body: Body, times: np.ndarray, qpos: np.ndarray) -> tuple[int, int] | None:
@@ -191,7 +210,97 @@ def _line_rules(
     return {"foremost contact behind the line": long_jump.LINE_X - float(front)}
 
 
+def _stride(body: Body, times: np.ndarray, qpos: np.ndarray) -> tuple[int, int] | None:
+    """First frame of the flight over the first hurdle and first frame after it.
+
+    None where the root does not cross the hurdle in flight, or where anything but one foot leaves
+    the ground last, or anything but the other foot lands first.
+    """
+    flight = _flight(body, times, qpos)
+    if flight is None or flight[0] == 0 or flight[1] >= len(qpos):
+        return None
+    off, down = flight
+    if not qpos[off, 0] < hurdling.FIRST_X < qpos[down, 0]:
+        return None
+    points, radii = support(body, qpos[[off - 1, down]])
+    owner = Geometry(body, "cpu").owner.tolist()
+    feet = []
+    for row in points[..., 2] - radii < TOUCH + 1e-6:
+        touching = {body.links[owner[i]].name for i in np.flatnonzero(row)}
+        if not all(name.endswith(("Ankle", "Toe")) for name in touching):
+            return None
+        feet.append({name[0] for name in touching})
+    return (off, down) if feet in ([{"L"}, {"R"}], [{"R"}, {"L"}]) else None
+
+
+def cleared_hurdle(body: Body, times: np.ndarray, qpos: np.ndarray) -> float:
+    """Top (m, to 2 mm) of the highest first hurdle that one flight clears without touching.
+
+    NaN where the root does not cross the hurdle in one flight from one foot to the other. What
+    happens after the landing is not the clearance.
+    """
+    stride = _stride(body, times, qpos)
+    if stride is None:
+        return float("nan")
+    return _hurdle(body).cleared(qpos[: stride[1] + 1])
+
+
+def _hurdle_rules(
+    body: Body, times: np.ndarray, qpos: np.ndarray, asked: dict[str, float]
+) -> dict[str, float]:
+    """Distance to the hurdle that was asked for, where the lead foot lands, and the speed of
+    the centre of mass before the landing as a share of the run's."""
+    stride = _stride(body, times, qpos)
+    if stride is None:
+        return {}
+    _, down = stride
+    points, radii = support(body, qpos[down : down + 1])
+    touch = points[0, :, 2] - radii < TOUCH + 1e-6
+    whole = qpos[: down + 1]
+    return {
+        "clearance over the hurdle": _hurdle(body).gap(whole, asked["hurdle_height"], 0.5),
+        "landing beyond the hurdle": float(points[0, touch, 0].min()) - hurdling.FIRST_X,
+        "speed at the landing": _speed(body, times, qpos, down) / asked["run_speed"],
+    }
+
+
+def _hurdle_judge(
+    body: Body, times: np.ndarray, qpos: np.ndarray, asked: dict[str, float]
+) -> dict[str, float]:
+    """Success: the asked hurdle is not touched, the other foot lands first at ``KEPT`` of the
+    asked speed, and nothing but that foot has touched the ground when the motion ends."""
+    found = _hurdle_rules(body, times, qpos, asked)
+    if not found:
+        return {"success": 0.0}
+    gap, kept = found["clearance over the hurdle"], found["speed at the landing"]
+    _, down = _flight(body, times, qpos) or (0, 0)
+    points, radii = support(body, qpos[down:])
+    owner = np.array([link.name[2:] in ("Ankle", "Toe") for link in body.links])
+    others = ~owner[Geometry(body, "cpu").owner.numpy()]
+    fell = bool((points[:, others, 2] - radii[others] < TOUCH).any()) or len(points) <= 1
+    return {
+        "success": float(gap >= 0.0 and kept >= KEPT and not fell),
+        "clearance": gap,
+        "hurdle_height": asked["hurdle_height"],
+        "landing_speed": kept * asked["run_speed"],
+    }
+
+
+def _speed(body: Body, times: np.ndarray, qpos: np.ndarray, at: int) -> float:
+    """Mean forward speed (m/s) of the centre of mass over the 0.1 s before a frame."""
+    first = int(np.searchsorted(times, times[at] - 0.1))
+    pos, quat = link_poses(body, qpos[[first, at]])
+    x = np.zeros(2)
+    for i, link in enumerate(body.links):
+        for shape in link.shapes:
+            middle = np.array([shape.center, shape.end or shape.center]).mean(0)
+            places = pos[:, i] + rotation.rotate(quat[:, i], np.tile(middle, (2, 1)))
+            x += shape.mass / body.mass * places[:, 0]
+    return float((x[1] - x[0]) / (times[at] - times[first]))
+
+
 OUTCOMES: dict[str, Outcome] = {
     "high_jump": Outcome("bar_height", cleared_height, _bar_rules),
     "long_jump": Outcome("length", jump_length, _line_rules),
+    "hurdling": Outcome("hurdle_height", cleared_hurdle, _hurdle_rules, _hurdle_judge, after=4),
 }

@@ -93,11 +93,15 @@ def _play(
     physics.close()
 
 
+_OPTIONS = {"high_jump": {"bar_height": "bar_height"}, "hurdling": {"hurdle_height": "height"}}
+"""By task: which ``asked`` outcome sets which of its options."""
+
+
 def scene_options(clip: Clip) -> dict[str, Any]:
     """The options of the clip's task that its ``asked`` outcome sets (``bar_height``)."""
     asked = clip.meta.get("asked")
-    known = ("bar_height",)
-    return {k: asked[k] for k in known if isinstance(asked, dict) and k in asked}
+    known = _OPTIONS.get(clip.meta.get("problem", ""), {})
+    return {known[k]: asked[k] for k in known if isinstance(asked, dict) and k in asked}
 
 
 def body_of(clip: Clip) -> Body:
@@ -123,12 +127,18 @@ def scene_of(clip: Clip) -> Scene:
 
 
 def play(
-    clip: Clip, task: str, options: dict[str, Any], body: Body, timestep_divisor: int = 1
+    clip: Clip,
+    task: str,
+    options: dict[str, Any],
+    body: Body,
+    timestep_divisor: int = 1,
+    hold: bool = True,
 ) -> tuple[Clip, dict[str, float]]:
     """Plays the clip's targets open loop from its first frame in the task's environment.
 
-    Returns the motion that came out, at the control rate until the task ended the episode, and
-    the task's metrics at that moment (those that are not NaN). The environment rounds states to
+    Where they end, the last ones are held until the task ends the episode; without ``hold`` the
+    motion ends with them. Returns the motion that came out, at the control rate, and the task's
+    metrics at that moment (those that are not NaN). The environment rounds states to
     float32 and its actions are limited, exactly as in training.
     """
     assert clip.ctrl is not None
@@ -152,7 +162,7 @@ def play(
     offset = env.physics.scene.action_offset()
     q, v = env.physics.scene.agent_qpos(0), env.physics.scene.agent_qvel(0)
     qpos, qvel, ctrl, metrics = [clip.qpos[0]], [clip.qvel[0]], [], {}
-    for step in range(env.max_steps):
+    for step in range(env.max_steps if hold else len(clip.ctrl) - 1):
         target = clip.ctrl[min(step, len(clip.ctrl) - 1)]
         action = torch.tensor((target - offset) / body.action_scale(), dtype=torch.float32)
         result = env.step(action[None, None])

@@ -174,8 +174,10 @@ def track(
     worlds = _Worlds(scene, settings.worlds, threads)
     frames = _reference(clip, worlds)
     steps, rules = len(frames.ctrl) - 1, None
+    outcome = OUTCOMES.get(clip.meta.get("problem", ""))
     if clip.meta.get("problem") in task_names():
-        frames = frames.held(settings.after)  # the bar and the mark are lost after the landing
+        after = settings.after if outcome is None else min(settings.after, outcome.after)
+        frames = frames.held(after)  # the bar and the mark are lost after the landing
     if clip.meta.get("problem") == "long_jump":
         rules = jump_rules(clip, scene, settings.weights)
     qpos, qvel, ctrl = _follow(frames, steps, worlds, settings, rules, progress)
@@ -188,8 +190,18 @@ def track(
         meta={**clip.meta, "source": f"{clip.meta.get('source', 'clip')}, tracked in MuJoCo"},
     )
     if clip.meta.get("problem") in task_names():
-        tracked, outcome = play(tracked, clip.meta["problem"], scene_options(clip), scene.body)
-        tracked.meta["achieved"] = outcome
+        judge = None if outcome is None else outcome.judge
+        tracked, achieved = play(
+            tracked,
+            clip.meta["problem"],
+            scene_options(clip),
+            scene.body,
+            hold=judge is None,
+        )
+        if judge is not None:
+            achieved |= judge(scene.body, tracked.times, tracked.qpos, clip.meta["asked"])
+            achieved["success"] *= len(tracked.qpos) == len(qpos)  # else the task broke it off
+        tracked.meta["achieved"] = achieved
         tracked.meta["events"] = flight_events(scene.body, tracked.times, tracked.qpos)
     links, *_ = worlds.kinematics(tracked.qpos[: steps + 1], tracked.qvel[: steps + 1])
     root = np.linalg.norm(tracked.qpos[: steps + 1, :3] - frames.qpos[: len(links), :3], axis=1)

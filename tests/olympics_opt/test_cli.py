@@ -162,7 +162,7 @@ def test_list_as_json(capsys):
     assert jump["obs"] == 358 + 6  # sports page: proprioception and goal features
     assert jump["metrics"]["height"] == "m"
     problems = {p["name"] for p in found["problems"]}
-    assert problems >= {"high_jump", "long_jump", "tennis", "javelin"}
+    assert problems >= {"high_jump", "long_jump", "hurdling", "tennis", "javelin"}
     for policy in found["pretrained"]:
         assert Path(policy["path"]).is_file()
 

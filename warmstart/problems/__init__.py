@@ -93,6 +93,14 @@ PROBLEMS: dict[str, Problem] = {
             sweep=(10.0, 12.0, 14.0),
             module="warmstart.problems.javelin",
         ),
+        Problem(
+            name="hurdling",
+            summary="one stride over a hurdle of given height at a given run speed",
+            outcome="hurdle_height",
+            unit="m",
+            sweep=(0.762, 0.838, 0.914, 0.991, 1.067),
+            module="warmstart.problems.hurdling",
+        ),
     )
 }
 

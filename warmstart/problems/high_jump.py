@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -20,7 +21,7 @@ from sports.humanoid.body import load_body
 from warmstart.contact import Ball, outline
 from warmstart.nlp import Result
 from warmstart.phases import Bounds, Phase
-from warmstart.problems import jumper
+from warmstart.problems import high_jump_styles, jumper
 from warmstart.separation import keep_apart
 from warmstart.solution import Solution
 from warmstart.transcription import Transcription
@@ -49,9 +50,14 @@ class Config(jumper.Config):
     """Least distance of the body over the bar at knots (m)."""
     approach_speed: tuple[float, float] = (2.0, 7.0)
     """Forward speed of the centre of mass at touch-down of the take-off foot (m/s)."""
+    style: Literal["tuck", "scissor", "flop"] = "tuck"
+    """``tuck``: straight at the bar, both legs drawn up. ``scissor``: sitting, one leg after the
+    other. ``flop``: back to the bar, landing on the back."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.style not in ("tuck", "scissor", "flop"):
+            raise ValueError(f"style must be tuck, scissor or flop, not {self.style}")
         if not 0.3 <= self.bar_height <= 2.6:
             raise ValueError(
                 f"bar_height must lie between 0.3 and 2.6 m, not {self.bar_height}: the world "
@@ -70,6 +76,8 @@ def bar_clearance(ball: Ball, p_W, bar_height):
 
 def transcribe(config: Config, elastic: bool = False) -> Transcription:
     """The nonlinear program; its parameter is the bar's height plus the clearance."""
+    if config.style != "tuck":
+        return high_jump_styles.transcribe(config, elastic)
     body = load_body("smpl", strength=config.strength)
     model = jumper.make_model(body)
     knots = jumper.scaled(config.detail)
@@ -183,9 +191,12 @@ def solve(
         config: Config, guess: Solution | None, elastic: bool = False, rough: bool = False
     ) -> tuple[Transcription, Result]:
         program = transcribe(config, elastic)
-        start = (
-            first_guess(program, config.bar_height) if guess is None else program.guess_from(guess)
-        )
+        if guess is not None:
+            start = program.guess_from(guess)
+        elif config.style == "tuck":
+            start = first_guess(program, config.bar_height)
+        else:
+            start = high_jump_styles.first_guess(program, config.style, config.bar_height)
         result = jumper.run(
             program,
             start,
@@ -212,4 +223,5 @@ def solve(
         solve_s=sum(r.solve_s for r in results),
         cpu_s=sum(r.cpu_s for r in results),
     )
-    return program.solution("high_jump", {"bar_height": config.bar_height}, total)
+    asked = {"bar_height": config.bar_height}
+    return program.solution("high_jump", asked, total, style=config.style)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -132,21 +133,25 @@ def start_rows(
     speed: tuple[float, float],
     sink: tuple[float, float],
     limb_rate: float,
+    swing: str = "R",
+    heading: float = 0.0,
 ) -> None:
     """The first knot is the touch-down of the take-off foot out of a run.
 
-    Centre of mass: forward ``speed`` (m/s), vertical velocity in ``sink`` (m/s), little
-    sideways; hinges no faster than ``limb_rate`` (rad/s); trunk upright. Rates are those before
-    the impact of the foot, where the program has one.
+    Centre of mass: forward ``speed`` (m/s) along ``heading`` (rad from +x towards +y), vertical
+    velocity in ``sink`` (m/s), little sideways; hinges no faster than ``limb_rate`` (rad/s);
+    trunk upright, the thigh of the ``swing`` leg hardly lifted. Rates are those before the impact
+    of the foot, where the program has one.
     """
     model = program.model
     rates = program.v[0] if program.before is None else program.before
 
     def build(q, v, p):
         _, com = center_of_mass(model.tree, model.motion(q, v))
+        c, s = math.cos(heading), math.sin(heading)
         return [
-            ("approach speed", com[0], *speed),
-            ("side speed", com[1], -0.2, 0.2),
+            ("approach speed", c * com[0] + s * com[1], *speed),
+            ("side speed", c * com[1] - s * com[0], -0.2, 0.2),
             ("sink speed", com[2], *sink),
         ]
 
@@ -156,8 +161,8 @@ def start_rows(
         "z": (0.80, 1.1),
         "pitch": (-0.45, 0.25),
         "roll": (-0.15, 0.15),
-        "yaw": (-0.3, 0.3),
-        "R_Hip_y": (-0.3, 0.6),
+        "yaw": (heading - 0.3, heading + 0.3),
+        f"{swing}_Hip_y": (-0.3, 0.6),
         "L_Shoulder_z": (-0.9, 0.9),
         "R_Shoulder_z": (-0.9, 0.9),
     }
@@ -193,18 +198,20 @@ def key_frames(
     return PchipInterpolator(times, poses, axis=0)(np.clip(at, times[0], times[-1]))
 
 
-def plant_foot(model: ReducedModel, q: np.ndarray, flat: np.ndarray, push: np.ndarray) -> None:
-    """Bends the left leg of a guess (K, n) so that its foot stays where it stands.
+def plant_foot(
+    model: ReducedModel, q: np.ndarray, flat: np.ndarray, push: np.ndarray, side: str = "L"
+) -> None:
+    """Bends the leg of a side of a guess (K, n) so that its foot stays where it stands.
 
     Planar two-link inverse kinematics about the hip. ``flat`` and ``push``: knots with the sole
     on the ground and with the heel rising to 0.8 rad. The ankle is placed under the middle of
     the root's path, so that the leg reaches forward first and back last.
     """
     tree = model.tree
-    thigh = -tree.offset[tree.link("L_Knee")][[0, 2]]
-    shin = -tree.offset[tree.link("L_Ankle")][[0, 2]]
-    hip = tree.offset[tree.link("L_Hip")]
-    heel, sole = 0.07, tree.offset[tree.link("L_Toe")]
+    thigh = -tree.offset[tree.link(f"{side}_Knee")][[0, 2]]
+    shin = -tree.offset[tree.link(f"{side}_Ankle")][[0, 2]]
+    hip = tree.offset[tree.link(f"{side}_Hip")]
+    heel, sole = 0.07, tree.offset[tree.link(f"{side}_Toe")]
     a, b = np.hypot(*thigh), np.hypot(*shin)
     knots = np.concatenate([flat, push])
     anchor = 0.5 * (q[knots[0], 0] + q[knots[-1], 0]) - 0.03
@@ -230,7 +237,7 @@ def plant_foot(model: ReducedModel, q: np.ndarray, flat: np.ndarray, push: np.nd
         knee = bend + shape[0] - shape[1]
         angles = hip_y, knee, lift - (pitch + hip_y + knee), -lift
         for joint, angle in zip(("Hip_y", "Knee_y", "Ankle_y", "Toe_y"), angles, strict=True):
-            q[k, model.index(f"L_{joint}")] = angle
+            q[k, model.index(f"{side}_{joint}")] = angle
 
 
 class _Progress(ca.Callback):
