@@ -13,6 +13,7 @@ Sampling, section 3; Williams 2017, Model Predictive Path Integral Control, for 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -56,10 +57,14 @@ class Tracking:
     """Standard deviation of the targets' spline, as a share of the servo's range effort / kp."""
     elites: int = 10
     """Candidates that are averaged, by rank."""
+    lost: float = math.inf
+    """Mean distance of the links from the reference's (m) beyond which the rest is given up."""
     seed: int = 0
     weights: Weights = field(default_factory=Weights)
 
     def __post_init__(self) -> None:
+        if not self.lost > 0:
+            raise ValueError(f"tracking cannot be lost from {self.lost} m on")
         if self.worlds < 2 or min(self.horizon, self.knot_every, self.elites) < 1:
             raise ValueError(
                 "tracking needs at least 2 worlds, and horizon, knot_every and elites of at least 1"
@@ -346,7 +351,10 @@ def _follow(
         plan = np.concatenate([plan[1:], plan[-1:]])
         if progress is not None:
             progress(now + 1, steps)
-    out_u.append(frames.ctrl[-1])
+        away = np.linalg.norm(worlds.link_pos[0] - frames.link_pos[now + 1], axis=1).mean()
+        if away > settings.lost:
+            break
+    out_u.append(frames.ctrl[len(out_u)])
     return np.array(out_q), np.array(out_v), np.array(out_u)
 
 
