@@ -1,4 +1,4 @@
-"""``olympics-opt mocap import``: recordings of people made into clips of the athlete."""
+"""``olympics-opt mocap``: recordings of people made into clips of the athlete."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from olympics_opt.mocap_track import Track, run_track
 from olympics_opt.progress import progress
 
 COLUMNS = (
@@ -63,14 +64,18 @@ def main(args: Sequence[str]) -> int:
     words = list(args)
     if not words or words[0] in ("-h", "--help"):
         print(
-            "usage: olympics-opt mocap import SOURCE --out DIR [options]\n\n"
-            "import  makes clips of recorded motions; olympics-opt mocap import --help lists "
-            "its options"
+            "usage: olympics-opt mocap import SOURCE --out DIR [options]\n"
+            "       olympics-opt mocap track CLIPS --out DIR [options]\n\n"
+            "import  makes clips of recorded motions\n"
+            "track   makes clips physical: the simulated athlete plays them\n\n"
+            "olympics-opt mocap import --help lists the options of a command"
         )
         return 0 if words else 2
-    if words[0] != "import":
-        raise ValueError(f"mocap has no command '{words[0]}'; it has: import")
-    return run_import(tyro.cli(Import, args=words[1:], prog="olympics-opt mocap import"))
+    if words[0] == "import":
+        return run_import(tyro.cli(Import, args=words[1:], prog="olympics-opt mocap import"))
+    if words[0] == "track":
+        return run_track(tyro.cli(Track, args=words[1:], prog="olympics-opt mocap track"))
+    raise ValueError(f"mocap has no command '{words[0]}'; it has: import, track")
 
 
 def run_import(config: Import) -> int:

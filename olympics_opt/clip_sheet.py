@@ -1,0 +1,78 @@
+"""Clips on one picture: a row for each, the same moments above one another."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from olympics_opt.camera import side_views
+from olympics_opt.episode import Player
+from olympics_opt.raycast import draw
+from olympics_opt.render import font
+from sports.humanoid.body import load_body
+from sports.scene import humanoid_scene
+from warmstart.atomic import write_bytes
+from warmstart.clip import Clip
+
+TITLE = 30
+"""Height of the strip above a row (pixels)."""
+
+
+def clip_sheet(
+    clips: Mapping[str, Clip],
+    path: str | Path,
+    *,
+    columns: int = 6,
+    panel: tuple[int, int] = (200, 240),
+) -> Path:
+    """Draws ``columns`` moments of each clip, from its beginning to the end of the shortest, seen
+    from the side; no GL library is needed. All rows share the views of the first clip.
+
+    Args:
+        clips: by the words that are written above the row.
+        path: PNG file, written atomically.
+        columns: pictures in a row, at least 2.
+        panel: width and height of a picture (pixels).
+
+    Raises:
+        ValueError: no clips, or fewer than 2 columns.
+    """
+    from PIL import Image, ImageDraw
+
+    if not clips or columns < 2:
+        raise ValueError("a sheet needs at least one clip and two columns")
+    times = np.linspace(0.0, min(clip.duration for clip in clips.values()), columns)
+    sheet = Image.new(
+        "RGB", (columns * panel[0], len(clips) * (TITLE + panel[1])), (255, 255, 255)
+    )
+    ink, views = ImageDraw.Draw(sheet), None
+    for row, (words, clip) in enumerate(clips.items()):
+        scene = humanoid_scene(load_body(clip.body))
+        player = Player(
+            SimpleNamespace(
+                task=scene.name,
+                scene=scene,
+                qpos=clip.at(times)["qpos"],
+                mocap_pos=np.zeros(0),
+                ground_force=np.zeros(0),
+                metrics={},
+                seed=0,
+                world=0,
+                dt=float(times[1]),
+            )
+        )
+        views = views or side_views(player, range(columns), *panel)
+        top = row * (TITLE + panel[1])
+        ink.text((8, top + 5), words, font=font(16), fill=(20, 26, 32))
+        for k, view in enumerate(views):
+            image = Image.fromarray(draw(player.solids(k), view, (), ground=None, ruler=False))
+            at = (k * panel[0], top + TITLE)
+            sheet.paste(image, at)
+            ink.text((at[0] + 6, at[1] + 4), f"{times[k]:.2f} s", font=font(13), fill=(40, 48, 56))
+    buffer = io.BytesIO()
+    sheet.save(buffer, "PNG", optimize=True)
+    return write_bytes(path, buffer.getvalue())
