@@ -46,9 +46,7 @@ def clip_sheet(
     if not clips or columns < 2:
         raise ValueError("a sheet needs at least one clip and two columns")
     times = np.linspace(0.0, min(clip.duration for clip in clips.values()), columns)
-    sheet = Image.new(
-        "RGB", (columns * panel[0], len(clips) * (TITLE + panel[1])), (255, 255, 255)
-    )
+    sheet = Image.new("RGB", (columns * panel[0], len(clips) * (TITLE + panel[1])), (255, 255, 255))
     ink, views = ImageDraw.Draw(sheet), None
     for row, (words, clip) in enumerate(clips.items()):
         scene = humanoid_scene(load_body(clip.body))

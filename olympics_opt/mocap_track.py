@@ -1,4 +1,4 @@
-"""``olympics-opt mocap track``: clips played by the simulated athlete, which makes them physical."""
+"""``olympics-opt mocap track``: clips made physical, played by the simulated athlete."""
 
 from __future__ import annotations
 
