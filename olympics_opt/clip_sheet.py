@@ -6,6 +6,7 @@ import io
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from olympics_opt.episode import Player
 from olympics_opt.raycast import draw
 from olympics_opt.render import font
 from sports.humanoid.body import load_body
-from sports.scene import humanoid_scene
+from sports.scene import Scene, humanoid_scene
 from warmstart.atomic import write_bytes
 from warmstart.clip import Clip
 
@@ -50,19 +51,7 @@ def clip_sheet(
     ink, views = ImageDraw.Draw(sheet), None
     for row, (words, clip) in enumerate(clips.items()):
         scene = humanoid_scene(load_body(clip.body))
-        player = Player(
-            SimpleNamespace(
-                task=scene.name,
-                scene=scene,
-                qpos=clip.at(times)["qpos"],
-                mocap_pos=np.zeros(0),
-                ground_force=np.zeros(0),
-                metrics={},
-                seed=0,
-                world=0,
-                dt=float(times[1]),
-            )
-        )
+        player = Player(_episode(scene, clip.at(times)["qpos"], float(times[1])))
         views = views or side_views(player, range(columns), *panel)
         top = row * (TITLE + panel[1])
         ink.text((8, top + 5), words, font=font(16), fill=(20, 26, 32))
@@ -74,3 +63,11 @@ def clip_sheet(
     buffer = io.BytesIO()
     sheet.save(buffer, "PNG", optimize=True)
     return write_bytes(path, buffer.getvalue())
+
+
+def _episode(scene: Scene, qpos: np.ndarray, dt: float) -> Any:
+    """Frames as the player of pictures wants them."""
+    nothing = np.zeros(0)
+    return SimpleNamespace(
+        task=scene.name, scene=scene, qpos=qpos, mocap_pos=nothing, ground_force=nothing, dt=dt
+    )

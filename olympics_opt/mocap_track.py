@@ -40,7 +40,7 @@ class Track:
     """Track each clip from this second on."""
     seconds: float | None = None
     """Track at most so much of each clip (s)."""
-    worlds: int = 48
+    worlds: int = 96
     """Candidates simulated at once: more follow closer and take longer."""
     seed: int = 0
     """Seed of the candidates."""

@@ -26,8 +26,8 @@ from warmstart.mocap.quality import SUNK
 from warmstart.mocap.retarget import local_rotations
 from warmstart.tracking import Tracking, track
 
-LIGHT = Tracking(worlds=48, horizon=12, iterations=2, noise=0.2)
-"""Tracking with feed-forward needs fewer candidates than the tracking of take-offs."""
+LIGHT = Tracking(worlds=96, horizon=12, iterations=2, noise=0.2)
+"""Tracking with feed-forward needs half the rounds of the tracking of take-offs."""
 
 
 @dataclass(frozen=True)
