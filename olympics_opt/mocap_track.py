@@ -18,6 +18,7 @@ COLUMNS = (
     ("left_over", "unphys %", "{:.1f}", 100.0),
     ("push", "push", "{:.1f}", 1.0),
     ("saturated", "limit %", "{:.1f}", 100.0),
+    ("sunk", "sunk %", "{:.1f}", 100.0),
 )
 """Figure of a clip, heading of its column, form, and factor."""
 

@@ -2,9 +2,8 @@
 
 A retargeted clip floats a little, slides a little and has no forces. Tracked in closed loop it
 becomes a motion of the simulated athlete, with PD targets that a policy could have played. The
-method is that of section III of the paper's pipeline (imitation replaces the raw reference), with
-:mod:`warmstart.tracking` in the place of a learned tracker. What cannot be followed is cut short
-or rejected, with the reason.
+paper does this step with a learned tracker (PHC; Luo et al. 2023); here :mod:`warmstart.tracking`
+does it, which needs no training. What cannot be followed is cut short or rejected, with the reason.
 """
 
 from __future__ import annotations
@@ -14,9 +13,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
+import mujoco
 import numpy as np
 
 from sports.humanoid.body import Body, load_body
+from sports.humanoid.mjcf import build_model
 from sports.scene import humanoid_scene
 from warmstart.clip import Clip
 from warmstart.feed_forward import GRAVITY, with_targets
@@ -199,10 +200,6 @@ def floor_push(clip: Clip, body: Body) -> float:
 
 def whole_momentum(clip: Clip, body: Body) -> np.ndarray:
     """(T, 3) linear momentum of the athlete (N s), world axes, by MuJoCo."""
-    import mujoco
-
-    from sports.humanoid.mjcf import build_model
-
     model = build_model(body)
     data = mujoco.MjData(model)
     out = np.empty((clip.num_frames, 3))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from olympics_opt import cli
@@ -91,8 +92,6 @@ def test_targets_give_the_torques_of_an_engine_that_knows_nothing_of_them():
     for ctrl in (ready.ctrl, clip.qpos[:, 7:]):
         physics = make_physics("mujoco", scene, 1)
         q, v = np.float32(clip.qpos[:1]), np.float32(clip.qvel[:1])
-        import torch
-
         state = PhysicsState(torch.tensor(q), torch.tensor(v), torch.zeros(1, 0, 3))
         physics.reset(torch.ones(1, dtype=torch.bool), state)
         for row in ctrl[:-1]:
@@ -113,8 +112,6 @@ def test_who_stands_stays(standing):
 
 
 def test_every_frame_of_a_corrected_clip_follows_from_the_one_before(standing):
-    import torch
-
     clip, worlds = standing.clip, standing.clip.num_frames - 1
     physics = make_physics("mujoco", humanoid_scene(BODY), worlds)
     state = PhysicsState(

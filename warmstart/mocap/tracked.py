@@ -181,6 +181,7 @@ def summary(entries: Iterable[Entry]) -> dict[str, Any]:
         else None,
         "left_over_percent_of_weight": mean("left_over"),
         "saturated_percent": mean("saturated"),
+        "sunk_frames_percent": mean("sunk"),
         "compute_seconds_per_second": round(sum(e.compute_seconds for e in read) / tracked, 2)
         if tracked
         else None,
