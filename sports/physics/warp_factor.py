@@ -28,10 +28,8 @@ import numpy as np
 import warp as wp
 from mujoco_warp._src import smooth, solver, types
 
-from sports.physics.warp_newton import MOST, find_direction
+from sports.physics.warp_newton import MOST, block_lanes, find_direction
 
-LANES = 128
-"""Threads of a block: four rows of 32."""
 SMALL = int(types.M_BLOCK_DENSE_MAX)
 """Trees of at most so many degrees of freedom are not factored here."""
 TILE = int(types.TILE_SIZE_JTDAJ_DENSE)
@@ -249,7 +247,7 @@ class Pieces:
     def _launch(
         self, m: Any, d: Any, M: wp.array, L: wp.array, D: wp.array, *solve: wp.array
     ) -> None:
-        lanes = LANES if wp.get_device().is_cuda else 1
+        lanes = block_lanes()
         solved, force = solve or (D, D)
         wp.launch(
             factor_kernel(self.size, self.dofs, bool(solve)),
@@ -284,7 +282,7 @@ def pieces(model: mujoco.MjModel) -> Pieces:
 
 def find_tiles(m: Any, d: Any, ctx: Any, skip_unchanged: bool, skip_noflip: bool) -> None:
     """Marks the Hessian's tiles that are not zero in ``ctx.h_tile_nz``."""
-    lanes = LANES if wp.get_device().is_cuda else 1
+    lanes = block_lanes()
     changed = ctx.quad_changed_count if skip_unchanged else d.nefc
     flipped = ctx.state_changed_count if skip_noflip else changed
     wp.launch(

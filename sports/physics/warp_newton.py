@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 LANES = 128
-"""Threads of a block: four warps."""
+"""Threads of a block on a GPU: four warps."""
 MOST = 200
 """Degrees of freedom of the largest model that is solved here: 80 kB of a block's 227 kB."""
 
@@ -158,6 +158,11 @@ _DIRECTION = """
 """
 
 
+def block_lanes() -> int:
+    """Threads of a block on Warp's current device; on a CPU it has one."""
+    return LANES if wp.get_device().is_cuda else 1
+
+
 @cache
 def direction_kernel(dofs: int, skip_noflip: bool) -> wp.Kernel:
     """Search direction -H^-1 g of worlds that ask for one, the square of its length, and its
@@ -204,7 +209,7 @@ def direction_kernel(dofs: int, skip_noflip: bool) -> wp.Kernel:
 
 def find_direction(m: Any, d: Any, ctx: Any, skip_noflip: bool) -> None:
     """Newton's direction of every world into ``ctx.search``."""
-    lanes = LANES if wp.get_device().is_cuda else 1
+    lanes = block_lanes()
     wp.launch(
         direction_kernel(m.nv, skip_noflip),
         dim=(d.nworld, lanes),

@@ -17,8 +17,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from warmstart.atomic import write_json
 from warmstart.mocap.readers import read_capture
+from warmstart.mocap.record import read_record, write_record
 from warmstart.mocap.retarget import retarget
 from warmstart.mocap.skeleton import JointMap
 from warmstart.mocap.source import Recording, recordings
@@ -77,7 +77,7 @@ def import_motions(
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is a file, not a folder for clips")
     key = json.dumps([FORMAT, options.__dict__, [m.__dict__ for m in maps]], sort_keys=True)
-    before = _read_record(out / RECORD)
+    before = read_record(out / RECORD, FORMAT, Entry)
     entries: list[Entry] = []
     taken: set[str] = set()
     wrote = False
@@ -97,12 +97,12 @@ def import_motions(
             entries.append(_one(recording, digest.hexdigest(), out, name, options, maps))
         wrote = wrote or entries[-1].status != "unreadable"
         if wrote and len(entries) % EVERY == 0:
-            write_record(out / RECORD, entries, before)
+            write_record(out / RECORD, FORMAT, entries, before)
         if show is not None:
             show(entries)
     if not wrote:
         raise ValueError(entries[0].reasons[0] if entries else "there is no motion to import")
-    write_record(out / RECORD, entries, before)
+    write_record(out / RECORD, FORMAT, entries, before)
     return entries
 
 
@@ -197,23 +197,6 @@ def _summary(entries: list[Entry]) -> dict[str, Any]:
         "jerk_source_m_s3": mean("jerk_source"),
         "frames_per_cpu_second": round(total / seconds, 1) if seconds else None,
     }
-
-
-def write_record(path: Path, entries: list[Entry], before: dict[str, Entry]) -> None:
-    """Writes the record: these entries, and those of files that this run has not come to."""
-    files = {**before, **{e.file: e for e in entries}}
-    write_json(path, {"format": FORMAT, "files": [e.__dict__ for e in files.values()]})
-
-
-def _read_record(path: Path) -> dict[str, Entry]:
-    """Entries by file; none where there is no record that can be read."""
-    try:
-        value = json.loads(path.read_text())
-        if value["format"] != FORMAT:
-            return {}
-        return {row["file"]: Entry(**row) for row in value["files"]}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return {}
 
 
 def _still_there(entry: Entry, out: Path) -> bool:

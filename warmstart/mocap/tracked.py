@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from warmstart.atomic import write_json
 from warmstart.clip import Clip
 from warmstart.correction import LIGHT, Bounds, correct
+from warmstart.mocap.record import read_record, write_record
 from warmstart.tracking import Tracking
 
 RECORD = "track.json"
@@ -93,7 +93,7 @@ def track_clips(
     if out.resolve() == home.resolve():
         raise ValueError(f"{out} holds the clips themselves: choose another folder for --out")
     key = json.dumps([FORMAT, asdict(options)], sort_keys=True).encode()
-    before, entries, wrote = _read_record(out / RECORD), [], False
+    before, entries, wrote = read_record(out / RECORD, FORMAT, Entry), [], False
     for path, name in found:
         digest = hashlib.sha256(key + path.read_bytes()).hexdigest()
         old = before.get(name)
@@ -104,9 +104,7 @@ def track_clips(
             entries.append(_one(path, name, digest, out, options, report))
         wrote = wrote or entries[-1].status != "unreadable"
         if wrote:
-            rows = {**before, **{e.file: e for e in entries}}
-            value = {"format": FORMAT, "files": [e.__dict__ for e in rows.values()]}
-            write_json(out / RECORD, value)
+            write_record(out / RECORD, FORMAT, entries, before)
         if show is not None:
             show(entries)
     if not wrote:
@@ -190,14 +188,3 @@ def summary(entries: Iterable[Entry]) -> dict[str, Any]:
 
 def _percent(part: int, whole: int) -> float | None:
     return round(100 * part / whole, 1) if whole else None
-
-
-def _read_record(path: Path) -> dict[str, Entry]:
-    """Entries by file; none where there is no record that can be read."""
-    try:
-        value = json.loads(path.read_text())
-        if value["format"] != FORMAT:
-            return {}
-        return {row["file"]: Entry(**row) for row in value["files"]}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return {}

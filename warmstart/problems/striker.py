@@ -30,9 +30,8 @@ from warmstart.rigid_body import load_tree, reduce_tree
 from warmstart.solution import Solution
 from warmstart.transcription import Transcription
 
-LEGS = ("Hip_x", "Hip_y", "Hip_z", "Knee_y", "Ankle_x", "Ankle_y", "Toe_y")
 FREE = (
-    *(f"{side}_{joint}" for side in "LR" for joint in LEGS),
+    *(f"{side}_{joint}" for side in "LR" for joint in jumper.LEGS),
     *(f"Torso_{axis}" for axis in "xyz"),
     *("Spine_z", "Chest_y", "Chest_z"),
     *(f"{side}_Shoulder_{axis}" for side in "LR" for axis in "xyz"),
