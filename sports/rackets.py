@@ -7,8 +7,10 @@ everything is turned by 180 degrees for the athlete at x < 0. World frame, m, s.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -82,6 +84,50 @@ class Game:
     def radius(self) -> float:
         """Of the ball (m)."""
         return BALLS[self.law].radius
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of every racket sport. Raises ValueError for a reward below 0 or a width outside
+    (0, 1]."""
+
+    ball_path: bool = False
+    """Whether athletes see where the ball will be at ten moments to come (``Game.moments``),
+    bounces at the court's height included."""
+    shadow: bool = True
+    """Pay how near racket and ball are in every step before a stroke, as the paper does. False: pay
+    only what is nearer than ever to this ball. Following the ball with the racket to its second
+    bounce earns more than risking a stroke (PPO, 24 M samples)."""
+    reach: float = 0.0
+    """Reward for each metre, of the last 4, by which the racket has come nearer to this ball than
+    ever before; 0 for the paper's terms alone. From 2.5 m the paper's reward for nearness is 0.002:
+    it leads nobody to a ball that is served wide."""
+    drive: float = 0.0
+    """Reward for a stroke, in the share of the way to the target that it will carry the ball, net
+    or not; 0 for the paper's terms alone, which pay nothing for a stroke that will not land in the
+    far court. From a tennis baseline that takes 15 m/s: of 100 000 strokes of PPO none did."""
+    width: float = 1.0
+    """Share of the width over which the machine spreads its balls (in training, to begin with)."""
+
+    def __post_init__(self) -> None:
+        for name in ("reach", "drive"):
+            if getattr(self, name) < 0.0:
+                raise ValueError(f"the reward '{name}' must not be negative: {getattr(self, name)}")
+        if not 0.0 < self.width <= 1.0:
+            raise ValueError(f"the width must be above 0 and at most 1, not {self.width}")
+
+
+@cache
+def narrowed(game: Game, width: float) -> Game:
+    """The game whose machine and feed spread their balls over a share of the width."""
+    serve, feed = game.serve, game.feed
+
+    def narrow(span: Range) -> Range:
+        return width * span[0], width * span[1]
+
+    serve = dataclasses.replace(serve, y=narrow(serve.y), land_y=narrow(serve.land_y))
+    feed = dataclasses.replace(feed, aside=narrow(feed.aside))
+    return dataclasses.replace(game, serve=serve, feed=feed)
 
 
 # Scene.

@@ -75,22 +75,13 @@ GAME = Game(
 
 
 @dataclass(frozen=True)
-class TableTennis:
+class TableTennis(rackets.Options):
     """Options of table tennis."""
 
-    ball_path: bool = False
-    """Whether athletes see where the ball will be in 0.05, 0.10, ... 0.50 s, bouncing at the
-    table's height."""
-    shadow: bool = True
-    """Pay how near racket and ball are in every step before a stroke, as the paper does. False: pay
-    only what is nearer than ever to this ball. Following the ball with the paddle to its second
-    bounce earns more than risking a stroke (PPO, 24 M samples)."""
-    reach: float = 0.0
-    """Reward for each metre, of the last 4, by which the paddle has come nearer to this ball than
-    ever before; 0 for the paper's terms alone."""
 
-    def __post_init__(self) -> None:
-        stroke.check_reach(self.reach)
+def game(config: TableTennis) -> Game:
+    """The game with the machine that the options ask for."""
+    return rackets.narrowed(GAME, config.width)
 
 
 def table() -> SceneObject:
@@ -137,30 +128,30 @@ def start(
     view: View, state: PhysicsState, context: Memory, generator: torch.Generator, training: bool
 ) -> tuple[PhysicsState, Memory]:
     """Launches the first ball and draws the numbers of the next ones."""
-    return rackets.draw(GAME, view, state, generator)
+    return rackets.draw(game(view.config), view, state, generator)
 
 
 def begin(view: View, context: Memory) -> Memory:
     """Memory after a reset: a ball is on its way, no stroke yet."""
-    return rackets.begin(GAME, view, context)
+    return rackets.begin(game(view.config), view, context)
 
 
 def features(view: View, memory: Memory) -> dict[str, torch.Tensor]:
     """Ball, its velocity, paddle and target (12), the opponent (9), the ball's path (30)."""
-    return rackets.features(GAME, view, memory)
+    return rackets.features(game(view.config), view, memory)
 
 
 def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
-    now = stroke.judge(GAME, view, memory, SHARPNESS)
+    rules = game(view.config)
+    now = stroke.judge(rules, view, memory, SHARPNESS)
     worth = 1.0 + (-now.miss).exp() + now.returns
     terms = {
         "approach": now.near if view.config.shadow else now.closer,
         "landing": worth * now.promising,
     }
-    if view.config.reach > 0.0:
-        terms["reach"] = view.config.reach * stroke.nearer(memory, now, SHARPNESS)
-    return stroke.conclude(GAME, view, memory, now, terms)
+    terms |= stroke.shaping(view, memory, now, SHARPNESS)
+    return stroke.conclude(rules, view, memory, now, terms)
 
 
 def scene_1v1(config: TableTennis, body: Body) -> Scene:

@@ -81,36 +81,27 @@ GAME = Game(
 
 
 @dataclass(frozen=True)
-class Tennis:
+class Tennis(rackets.Options):
     """Options of tennis."""
 
     net: Literal["level", "rules"] = "level"
     """1 m high everywhere, as in the paper, or 0.914 m in the middle and 1.07 m at the posts."""
-    ball_path: bool = False
-    """Whether athletes see where the ball will be in 0.1, 0.2, ... 1.0 s, bounces included."""
-    shadow: bool = True
-    """Pay how near racket and ball are in every step before a stroke, as the paper does. False: pay
-    only what is nearer than ever to this ball. Following the ball with the racket to its second
-    bounce earns more than risking a stroke (PPO, 24 M samples)."""
-    reach: float = 0.0
-    """Reward for each metre, of the last 4, by which the racket has come nearer to this ball than
-    ever before; 0 for the paper's terms alone. From 2.5 m the paper's reward for nearness is 0.002:
-    it leads nobody to a ball that is served wide."""
 
     def __post_init__(self) -> None:
         if self.net not in ("level", "rules"):
             raise ValueError(f"the net must be 'level' or 'rules', not '{self.net}'")
-        stroke.check_reach(self.reach)
+        super().__post_init__()
 
 
 @cache
 def game(config: Tennis) -> Game:
-    """The game with the net that the options ask for."""
+    """The game with the net and the machine that the options ask for."""
+    rules = rackets.narrowed(GAME, config.width)
     if config.net == "level":
-        return GAME
+        return rules
     rise = NET_POSTS - NET_MIDDLE
     court = dataclasses.replace(GAME.court, net_height=NET_MIDDLE, net_rise=rise)
-    return dataclasses.replace(GAME, court=court)
+    return dataclasses.replace(rules, court=court)
 
 
 def net(court: Court) -> tuple[SceneObject, ...]:
@@ -177,8 +168,7 @@ def advance(view: View, memory: Memory) -> Advance:
         "landing": (1.0 + (-now.miss).exp()) * now.promising,
         "bounce": now.landed.float(),
     }
-    if view.config.reach > 0.0:
-        terms["reach"] = view.config.reach * stroke.nearer(memory, now, SHARPNESS)
+    terms |= stroke.shaping(view, memory, now, SHARPNESS)
     return stroke.conclude(rules, view, memory, now, terms)
 
 
