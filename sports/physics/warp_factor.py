@@ -3,13 +3,16 @@
 * MuJoCo Warp factors the joint-space inertia of a tree of more than 64 degrees of freedom with one
   kernel for every level of the tree, each passing over the memory of all worlds: 70 launches a
   substep, 45 % of a control step of SMPL-X on an H200 and 39 % of SMPL's. Here a block of threads
-  takes a tree of a world into its shared memory, goes through all levels and solves at once. The
-  algorithm is the same: L^T D L along the ancestors of each degree of freedom; Featherstone, Rigid
-  Body Dynamics Algorithms (2008), section 6.5.
-* Newton's direction: ``warp_newton.py``, for up to 200 degrees of freedom.
+  takes a tree of a world into its shared memory and goes through all levels. The algorithm is the
+  same: L^T D L along the ancestors of each degree of freedom; Featherstone, Rigid Body Dynamics
+  Algorithms (2008), section 6.5.
 * Of more than 96 degrees of freedom it asks which 16 x 16 tiles of the solver's Hessian are zero,
   with half a million blocks of threads that mostly have nothing to do (13 %). Here a block takes a
-  world; for models that are too large for the direction above.
+  world.
+
+Tried on an H200 and slower (4096 worlds, steps/s of long jump and javelin; the library's own pieces
+242 k and 21.8 k, these 333 k and 32.8 k): factor and solution in one launch with rows in registers,
+321 k and 32.3 k; with it Newton's direction by a block a world in shared memory, 211 k and 22.7 k.
 
 This module alone depends on MuJoCo Warp's inner names (4.0); ``tests/sports/test_warp_factor.py``
 says whether another version still has them.
@@ -28,103 +31,54 @@ import numpy as np
 import warp as wp
 from mujoco_warp._src import smooth, solver, types
 
-from sports.physics.warp_newton import MOST, block_lanes, find_direction
-
+LANES = 128
+"""Threads of a block: four rows of 32."""
 SMALL = int(types.M_BLOCK_DENSE_MAX)
 """Trees of at most so many degrees of freedom are not factored here."""
 TILE = int(types.TILE_SIZE_JTDAJ_DENSE)
-FEW = int(solver._BLOCK_CHOLESKY_DIM)
-"""Models of at most so many degrees of freedom are left to MuJoCo Warp."""
+MANY = int(solver._SPARSE_BLOCK_CHOLESKY_DIM)
+"""Models of more degrees of freedom have their Hessian's tiles looked at."""
 
 _FACTOR = """
 #if defined(__CUDA_ARCH__)
-    __shared__ float rows[SIZE], rhs[DOFS];
-    __shared__ unsigned short columns[SIZE], starts[DOFS + 1];
-#define WAIT_WARP() __syncwarp()
+    __shared__ float rows[SIZE];
+    __shared__ unsigned short targets[SIZE];
 #else
-    float rows[SIZE], rhs[DOFS];
-    unsigned short columns[SIZE], starts[DOFS + 1];
-#define WAIT_WARP()
+    float rows[SIZE];
+    unsigned short targets[SIZE];
 #endif
-    const int first = tree[0], dofs = tree[1] - first + 1, base = begin.data[first];
-    const int size = begin.data[tree[1]] + length.data[tree[1]] - base;
+    const int first = tree[0], last = tree[1], base = begin.data[first];
+    const int size = begin.data[last] + length.data[last] - base;
     const size_t world = w;
     const float* source = (const float*)((const char*)inertia.data + world * inertia.strides[0]);
     float* result = (float*)((char*)factor.data + world * factor.strides[0]);
     float* inverses = (float*)((char*)diagonal.data + world * diagonal.strides[0]);
     for (int e = lane; e < size; e += lanes) {
         rows[e] = source[base + e];
-        columns[e] = (unsigned short)(column.data[base + e] - first);
+        targets[e] = (unsigned short)(begin.data[column.data[base + e]] - base);
     }
-    for (int k = lane; k < dofs; k += lanes)
-        starts[k] = (unsigned short)(begin.data[first + k] - base);
-#if SOLVE
-    const float* right = (const float*)((const char*)force.data + world * force.strides[0]);
-    float* solution = (float*)((char*)solved.data + world * solved.strides[0]);
-    for (int k = lane; k < dofs; k += lanes)
-        rhs[k] = right[first + k];
-#endif
-    if (lane == 0)
-        starts[dofs] = (unsigned short)size;
     WP_TILE_SYNC();
-    const int width = lanes < 32 ? lanes : 32, stride = lanes / width;
-    const int high = lane / width, across = lane % width;
-    for (int k = dofs - 1; k >= 0; --k) {
-        const int row = starts[k], ancestors = starts[k + 1] - row - 1;
+    const int width = lanes < 32 ? lanes : 32;
+    const int high = lane / width, across = lane % width, stride = lanes / width;
+    for (int k = last; k >= first; --k) {
+        const int row = begin.data[k] - base, ancestors = length.data[k] - 1;
         const float scale = 1.0f / rows[row + ancestors];
-#if SOLVE
-        if (high == 0) {
-            const float known = rhs[k] * scale;
-            for (int a = across; a < ancestors; a += width)
-                rhs[columns[row + a]] -= rows[row + a] * known;
-        }
-#endif
-        for (int b = across; b < ancestors; b += width) {
-            const float share = rows[row + b] * scale;
-            // All lanes of a row of 32 go through the same rows a >= b, four of them at a time.
-            const int skipped = (b - across - high + stride - 1) / stride;
-            const int start = high + (skipped > 0 ? skipped : 0) * stride;
-            for (int a = start; a < ancestors; a += 4 * stride) {
-                float value[4];
-                int place[4];
-#pragma unroll
-                for (int j = 0; j < 4; ++j) {
-                    const int c = a + j * stride;
-                    place[j] = c >= b && c < ancestors ? starts[columns[row + c]] + b : -1;
-                    if (place[j] >= 0)
-                        value[j] = rows[place[j]] - share * rows[row + c];
-                }
-#pragma unroll
-                for (int j = 0; j < 4; ++j)
-                    if (place[j] >= 0)
-                        rows[place[j]] = value[j];
-            }
+        for (int a = high; a < ancestors; a += stride) {
+            const float share = rows[row + a] * scale;
+            float* target = rows + targets[row + a];
+            for (int b = across; b <= a; b += width)
+                target[b] -= share * rows[row + b];
         }
         WP_TILE_SYNC();
     }
-#if SOLVE
-    // What a degree of freedom has found is taken from its descendants, which follow it.
-    if (high == 0) {
-        for (int k = 0; k < dofs; ++k) {
-            const int depth = starts[k + 1] - starts[k] - 1, end = ends.data[first + k] - first;
-            const float x = rhs[k] / rows[starts[k] + depth];
-            WAIT_WARP();
-            for (int i = k + 1 + across; i < end; i += width)
-                rhs[i] -= rows[starts[i] + depth] * x;
-            if (across == 0)
-                solution[first + k] = x;
-            WAIT_WARP();
-        }
-    }
-#endif
-    for (int k = high; k < dofs; k += stride) {
-        const int row = starts[k], ancestors = starts[k + 1] - row - 1;
+    for (int k = first + high; k <= last; k += stride) {
+        const int row = begin.data[k] - base, ancestors = length.data[k] - 1;
         const float pivot = rows[row + ancestors], scale = 1.0f / pivot;
         for (int a = across; a < ancestors; a += width)
             result[base + row + a] = rows[row + a] * scale;
         if (across == 0) {
             result[base + row + ancestors] = pivot;
-            inverses[first + k] = scale;
+            inverses[k] = scale;
         }
     }
     WP_TILE_SYNC();
@@ -132,14 +86,11 @@ _FACTOR = """
 
 
 @cache
-def factor_kernel(size: int, dofs: int, solve: bool) -> wp.Kernel:
-    """L and 1/D of the inertia of trees with at most ``size`` entries: a row for each of at most
-    ``dofs`` degrees of freedom, a column for each of its ancestors and itself. With ``solve`` also
-    the accelerations (``solved``) that forces give such an inertia. ``ends``: for each degree of
-    freedom the first one after it that does not hang on it."""
-    snippet = _FACTOR.replace("SIZE", str(size)).replace("DOFS", str(dofs))
+def factor_kernel(size: int) -> wp.Kernel:
+    """L and 1/D of the inertia of trees with at most ``size`` entries: a row for each degree of
+    freedom, a column for each of its ancestors and itself."""
 
-    @wp.func_native(snippet=snippet.replace("SOLVE", str(int(solve))))
+    @wp.func_native(snippet=_FACTOR.replace("SIZE", str(size)))
     def factor_tree(
         w: int,
         lane: int,
@@ -148,12 +99,9 @@ def factor_kernel(size: int, dofs: int, solve: bool) -> wp.Kernel:
         length: wp.array(dtype=int),  # type: ignore[valid-type]
         begin: wp.array(dtype=int),  # type: ignore[valid-type]
         column: wp.array(dtype=int),  # type: ignore[valid-type]
-        ends: wp.array(dtype=int),  # type: ignore[valid-type]
         inertia: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        force: wp.array2d(dtype=float),  # type: ignore[valid-type]
         factor: wp.array2d(dtype=float),  # type: ignore[valid-type]
         diagonal: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        solved: wp.array2d(dtype=float),  # type: ignore[valid-type]
     ): ...
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -162,19 +110,13 @@ def factor_kernel(size: int, dofs: int, solve: bool) -> wp.Kernel:
         length: wp.array(dtype=int),  # type: ignore[valid-type]
         begin: wp.array(dtype=int),  # type: ignore[valid-type]
         column: wp.array(dtype=int),  # type: ignore[valid-type]
-        ends: wp.array(dtype=int),  # type: ignore[valid-type]
         inertia: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        force: wp.array2d(dtype=float),  # type: ignore[valid-type]
         factor: wp.array2d(dtype=float),  # type: ignore[valid-type]
         diagonal: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        solved: wp.array2d(dtype=float),  # type: ignore[valid-type]
     ):
         w, t, lane = wp.tid()
         lanes = wp.block_dim()
-        factor_tree(
-            w, lane, lanes, trees[t], length, begin, column, ends,
-            inertia, force, factor, diagonal, solved,
-        )  # fmt: skip
+        factor_tree(w, lane, lanes, trees[t], length, begin, column, inertia, factor, diagonal)
 
     return factor_trees
 
@@ -225,35 +167,17 @@ class Pieces:
 
     trees: wp.array
     """(T,) first and last degree of freedom of the trees that are factored here."""
-    ends: wp.array
-    """(nv,) for each degree of freedom the first one after it that does not hang on it."""
     size: int
-    """Entries of the inertia of the largest tree."""
-    dofs: int
-    """Its degrees of freedom."""
+    """Entries of the inertia of the largest one."""
 
     def factor(self, m: Any, d: Any, M: wp.array, L: wp.array, D: wp.array) -> None:
         """In place of ``smooth._factor_i_sparse``."""
-        self._launch(m, d, M, L, D)
-
-    def factor_and_solve(
-        self, m: Any, d: Any, M: wp.array, L: wp.array, D: wp.array, x: wp.array, y: wp.array
-    ) -> None:
-        """In place of ``smooth.factor_solve_i``: M x = y. Small trees are MuJoCo Warp's."""
-        if m.M_tiles:
-            smooth._factor_solve_blocks(m, d, M, L, D, x, y)
-        self._launch(m, d, M, L[:, m.qLD_block_total :], D, x, y)
-
-    def _launch(
-        self, m: Any, d: Any, M: wp.array, L: wp.array, D: wp.array, *solve: wp.array
-    ) -> None:
-        lanes = block_lanes()
-        solved, force = solve or (D, D)
+        lanes = LANES if wp.get_device().is_cuda else 1
         wp.launch(
-            factor_kernel(self.size, self.dofs, bool(solve)),
+            factor_kernel(self.size),
             dim=(d.nworld, self.trees.shape[0], lanes),
-            inputs=[self.trees, m.M_rownnz, m.M_rowadr, m.M_colind, self.ends, M, force],
-            outputs=[L, D, solved],
+            inputs=[self.trees, m.M_rownnz, m.M_rowadr, m.M_colind, M],
+            outputs=[L, D],
             block_dim=lanes,
         )
 
@@ -263,26 +187,15 @@ def pieces(model: mujoco.MjModel) -> Pieces:
     starts = np.asarray(model.tree_dofadr)
     last = starts + np.asarray(model.tree_dofnum) - 1
     large = np.flatnonzero(last - starts >= SMALL)
-    begin, length = np.asarray(model.M_rowadr), np.asarray(model.M_rownnz)
-    sizes = [begin[last[t]] + length[last[t]] - begin[starts[t]] for t in large]
+    entry = np.asarray(model.M_rowadr), np.asarray(model.M_rownnz)
+    sizes = [entry[0][last[t]] + entry[1][last[t]] - entry[0][starts[t]] for t in large]
     trees = np.stack((starts[large], last[large]), 1).astype(np.int32)
-    dofs = trees[:, 1] - trees[:, 0] + 1
-    ends = np.arange(1, model.nv + 1)
-    for k in reversed(range(model.nv)):
-        parent = model.dof_parentid[k]
-        if parent >= 0:
-            ends[parent] = max(ends[parent], ends[k])
-    return Pieces(
-        wp.array(trees, dtype=wp.vec2i),
-        wp.array(ends.astype(np.int32), dtype=int),
-        int(max(sizes, default=0)),
-        int(dofs.max(initial=0)),
-    )
+    return Pieces(wp.array(trees, dtype=wp.vec2i), int(max(sizes, default=0)))
 
 
 def find_tiles(m: Any, d: Any, ctx: Any, skip_unchanged: bool, skip_noflip: bool) -> None:
     """Marks the Hessian's tiles that are not zero in ``ctx.h_tile_nz``."""
-    lanes = block_lanes()
+    lanes = LANES if wp.get_device().is_cuda else 1
     changed = ctx.quad_changed_count if skip_unchanged else d.nefc
     flipped = ctx.state_changed_count if skip_noflip else changed
     wp.launch(
@@ -297,12 +210,9 @@ def find_tiles(m: Any, d: Any, ctx: Any, skip_unchanged: bool, skip_noflip: bool
 def solve_direction(
     m: Any, d: Any, ctx: Any, skip_unchanged: bool = False, skip_noflip: bool = False
 ) -> None:
-    """In place of ``solver._cholesky_factorize_solve``. Larger models than ``warp_newton`` takes
-    have their tiles found by one block a world; the rest is MuJoCo Warp's."""
-    if FEW < m.nv <= MOST:
-        find_direction(m, d, ctx, skip_noflip)
-        return
-    if m.nv <= FEW:
+    """In place of ``solver._cholesky_factorize_solve`` for models of many degrees of freedom: the
+    tiles are found by one block a world, the rest is MuJoCo Warp's."""
+    if m.nv <= MANY:
         _their_direction(m, d, ctx, skip_unchanged, skip_noflip)
         return
     changed = ctx.quad_changed_count if skip_unchanged else d.nefc
@@ -346,12 +256,12 @@ _their_direction = solver._cholesky_factorize_solve
 @contextmanager
 def faster(own: Pieces) -> Iterator[None]:
     """MuJoCo Warp works with the pieces of this module inside the block."""
-    theirs = smooth._factor_i_sparse, smooth.factor_solve_i
+    theirs = smooth._factor_i_sparse
     try:
         if own.size:
-            smooth._factor_i_sparse, smooth.factor_solve_i = own.factor, own.factor_and_solve
+            smooth._factor_i_sparse = own.factor
         solver._cholesky_factorize_solve = solve_direction
         yield
     finally:
-        smooth._factor_i_sparse, smooth.factor_solve_i = theirs
+        smooth._factor_i_sparse = theirs
         solver._cholesky_factorize_solve = _their_direction

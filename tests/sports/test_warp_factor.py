@@ -16,7 +16,6 @@ from sports.env import make_scene
 from sports.humanoid.mjcf import build_model
 from sports.physics.warp import WarpPhysics
 from sports.physics.warp_factor import TILE, faster, find_tiles, pieces
-from sports.physics.warp_newton import find_direction
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(),
                                                                reason="needs a GPU"))]  # fmt: skip
@@ -95,54 +94,9 @@ def test_tiles_with_an_entry_are_found(device: str):
     assert (found[2:] == 9).all()
 
 
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("dofs", [75, 165])
-def test_the_direction_of_every_world_solves_its_equations(dofs: int, device: str):
-    """Against a dense solution in double precision; contacts couple what a tree does not."""
-    rng = np.random.default_rng(dofs)
-    worlds, pad = 6, -(-(dofs + 1) // TILE) * TILE
-    hessian, gradient = np.zeros((worlds, pad, pad)), np.zeros((worlds, pad))
-    for world in range(worlds):
-        h = np.diag(rng.uniform(0.5, 2.0, dofs))
-        for k in range(dofs):
-            chain = np.arange(max(0, k - 20), k + 1)
-            push = 0.3 * rng.normal(size=len(chain))
-            h[np.ix_(chain, chain)] += np.outer(push, push)
-        for _ in range(world):
-            touched = rng.choice(dofs, 15, replace=False)
-            push = 3.0 * rng.normal(size=15)
-            h[np.ix_(touched, touched)] += np.outer(push, push)
-        hessian[world, :dofs, :dofs] = np.triu(h)
-        gradient[world, :dofs] = rng.normal(size=dofs)
-    below = np.tril(np.full((pad, pad), 7.0), -1)  # not looked at, like the rows beyond
-    with wp.ScopedDevice(device):
-        ctx = SimpleNamespace(
-            done=wp.array([False] * 4 + [True, False], dtype=bool),
-            h=wp.array(hessian + below, dtype=float),
-            grad=wp.array(gradient, dtype=float),
-            state_changed_count=wp.array([1, 1, 1, 1, 1, 0], dtype=int),
-            search=wp.full((worlds, dofs), 5.0, dtype=float),
-            search_dot=wp.full(worlds, 5.0, dtype=float),
-            newton_decrement=wp.full(worlds, 5.0, dtype=float),
-        )
-        model, data = SimpleNamespace(nv=dofs), SimpleNamespace(nworld=worlds, nefc=None)
-        find_direction(model, data, ctx, True)
-        search, square, product = (
-            x.numpy() for x in (ctx.search, ctx.search_dot, ctx.newton_decrement)
-        )
-    for world in range(4):
-        upper = hessian[world, :dofs, :dofs]
-        right = np.linalg.solve(upper + np.triu(upper, 1).T, gradient[world, :dofs])
-        assert np.abs(search[world] + right).max() < 1e-4 * np.abs(right).max()
-        assert square[world] == pytest.approx(right @ right, rel=1e-4)
-        assert product[world] == pytest.approx(right @ gradient[world, :dofs], rel=1e-4)
-    # Done, and unchanged: left as they were.
-    assert (search[4:] == 5.0).all() and (square[4:] == 5.0).all() and (product[4:] == 5.0).all()
-
-
 def test_the_library_is_as_before_outside_the_block():
     def inner() -> tuple:
-        return smooth._factor_i_sparse, smooth.factor_solve_i, solver._cholesky_factorize_solve
+        return smooth._factor_i_sparse, solver._cholesky_factorize_solve
 
     own = inner()
     with pytest.raises(ZeroDivisionError), faster(pieces(build_model(make_scene("long_jump")))):
