@@ -156,7 +156,7 @@ def advance(view: View, memory: Memory) -> Advance:
     weights = constant(_WEIGHTS, root.device).view(3, 4)
     names = ("grab", "start", "goal", "attitude")
     stage = (clock >= HOLD_STEPS).long() + late
-    terms = dict(zip(names, (weights[stage] * shares).unbind(-1)))
+    terms: dict[str, Tensor] = dict(zip(names, (weights[stage] * shares).unbind(-1)))
     opening = torch.maximum(memory["opening"], _opening(view, nose))
     if view.config.let_go > 0.0:
         terms["let_go"] = view.config.let_go * (opening - memory["opening"]).masked_fill(held, 0.0)
