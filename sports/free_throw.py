@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from sports import ball_games, quaternion
-from sports.hoop import RIM_HEIGHT, aim, crossing, hoop
+from sports.hoop import RIM_HEIGHT, aim, arrival, crossing, hoop
 from sports.humanoid.body import Body
 from sports.humanoid.hold import BASKETBALL, load_hold
 from sports.scene import GROUND, Scene
@@ -56,6 +56,16 @@ FEET = ("L_Ankle", "R_Ankle")
 @dataclass(frozen=True)
 class FreeThrow:
     """Options of the free throw."""
+
+    entry: float = 0.0
+    """Reward per step for where the ball would come down through the rim's plane,
+    exp(-4 m^-2 miss^2), until it is free and then as it was at the release; 0 for the paper's terms
+    alone. Those hardly tell a basket from a ball 0.5 m off: PPO (18 M samples) threw 1.4 m off on
+    average."""
+
+    def __post_init__(self) -> None:
+        if self.entry < 0.0:
+            raise ValueError(f"the reward for the entry must not be negative: {self.entry}")
 
 
 def scene(config: FreeThrow, body: Body) -> Scene:
@@ -91,6 +101,7 @@ def begin(view: View, context: Memory) -> Memory:
         "thrown": zero > 0,
         "aim": zero.clone(),
         "toward": zero.clone(),
+        "entry": zero.clone(),
         "release_speed": nothing.clone(),
         "release_height": nothing.clone(),
         "miss": nothing.clone(),
@@ -147,6 +158,7 @@ def advance(view: View, memory: Memory) -> Advance:
 
     aimed = at_release("aim", 0.5 * aim(ball, velocity, rim))
     toward = at_release("toward", 0.5 * ball_games.toward(ball, velocity, rim))
+    entry = at_release("entry", torch.exp(-4.0 * arrival(ball, velocity, rim).square()))
 
     cross = crossing(memory["ball"], ball, rim, view.control_timestep)
     rises_through = cross.up & cross.inside
@@ -165,6 +177,7 @@ def advance(view: View, memory: Memory) -> Advance:
         "thrown": thrown,
         "aim": aimed,
         "toward": toward,
+        "entry": entry,
         "release_speed": at_release("release_speed", length(velocity)),
         "release_height": at_release("release_height", ball[:, 2]),
         "miss": torch.where(first_pass, cross.miss, memory["miss"]),
@@ -173,13 +186,12 @@ def advance(view: View, memory: Memory) -> Advance:
     }
     released = torch.stack((memory["release_speed"], memory["release_height"]))
     speed, height = nan_where(~thrown, released).unbind()
+    terms = {"aim": aimed, "toward": toward, "basket": success.float()}
+    if view.config.entry > 0.0:
+        terms["entry"] = view.config.entry * entry
     return Advance(
         memory=memory,
-        terms={
-            "aim": aimed[:, None],
-            "toward": toward[:, None],
-            "basket": success.float()[:, None],
-        },
+        terms={name: term[:, None] for name, term in terms.items()},
         terminated=(failed | success)[:, None],
         metrics={
             "success": success.float(),

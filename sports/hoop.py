@@ -85,6 +85,17 @@ def aim(ball: Tensor, velocity: Tensor, rim: Tensor) -> Tensor:
     return torch.exp(-0.1 * squared(velocity - shot(ball, rim)))
 
 
+def arrival(ball: Tensor, velocity: Tensor, rim: Tensor) -> Tensor:
+    """(...) distance (m) from the rim's middle at which a ball that flew on freely would come down
+    through its plane; infinite for one that would not reach it."""
+    drop = ball[..., 2] - rim[..., 2]
+    square = velocity[..., 2].square() + 2 * GRAVITY * drop
+    time = (velocity[..., 2] + square.clamp(min=0.0).sqrt()) / GRAVITY
+    miss = (ball + time[..., None] * velocity - rim)[..., :2]
+    reaches = (square >= 0) & (time >= 0)
+    return torch.hypot(miss[..., 0], miss[..., 1]).masked_fill(~reaches, torch.inf)
+
+
 class Crossing(NamedTuple):
     """How a ball went through the plane of a rim in one control step."""
 

@@ -19,8 +19,8 @@ FINGERTIP = 0.16
 class Throw(HandMade):
     """A free throw whose ball and contacts are decided by the test."""
 
-    def __init__(self, num_worlds: int = 1) -> None:
-        super().__init__("free_throw", num_worlds)
+    def __init__(self, num_worlds: int = 1, **options: object) -> None:
+        super().__init__("free_throw", num_worlds, **options)
         scene = self.env.physics.scene
         self.q, self.v = scene.object_qpos("ball").start, scene.object_qvel("ball").start
         self.hold = self.state.qpos[0, self.q : self.q + 3].tolist()
@@ -386,3 +386,18 @@ def test_the_throw_is_the_same_at_half_the_time_step_and_in_drake(engine: str, d
     for name, tolerance in (("release_speed", 0.5), ("release_height", 0.06)):
         expected = float(here.metrics[name])
         assert float(there.metrics[name]) == pytest.approx(expected, abs=tolerance), name
+
+
+def test_the_entry_is_paid_as_it_was_at_the_release():
+    """A ball that will come down 0.3 m beyond the rim's middle, whatever it meets afterwards."""
+    world = Throw(entry=2.0)
+    up, time = 6.9, (6.9 + math.sqrt(6.9**2 - 2 * 9.81 * (3.05 - 1.9))) / 9.81
+    velocity = ((4.5 + 0.3 - 0.6) / time, 0.0, up)
+    world.step(touch=20.0)
+    for ball, speed in (((0.6, 0.0, 1.9), velocity), ((0.7, 0.0, 2.1), (0.0, 0.0, 0.0))):
+        step = world.step(ball, speed)
+        assert step.terms["entry"][0, 0] == pytest.approx(2 * math.exp(-4 * 0.09), abs=1e-4)
+    assert world.step((0.7, 0.0, 2.1), touch=0.0).terms["entry"][0, 0] > 1.0
+    assert "entry" not in Throw().step().terms
+    with pytest.raises(ValueError, match="must not be negative"):
+        make_env("free_throw", num_worlds=1, options={"entry": -1.0})

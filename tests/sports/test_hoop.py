@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from sports.hoop import BOARD_BEHIND, RIM_HEIGHT, RING_RADIUS, aim, crossing, hoop, shot
+from sports.hoop import (
+    BOARD_BEHIND,
+    RIM_HEIGHT,
+    RING_RADIUS,
+    aim,
+    arrival,
+    crossing,
+    hoop,
+    shot,
+)
 from sports.humanoid.body import load_body
 from sports.humanoid.hold import BASKETBALL
 from sports.physics import default_state, make_physics
@@ -139,3 +148,21 @@ def test_a_ball_passes_the_ring_only_where_it_fits():
         before = physics.object_pos[:, 0].clone()
     assert (miss[:2] < 0.115).all() and miss[2] > RING_RADIUS
     physics.close()
+
+
+def test_where_a_ball_would_arrive_is_where_it_does():
+    """Against the path of every millisecond; a ball that stays below the rim arrives nowhere."""
+    rim = torch.tensor((4.5, 0.0, 3.05))
+    for place, velocity in (
+        ((0.4, 0.1, 1.7), (3.5, 0.2, 7.0)),
+        ((0.4, 0.0, 1.7), (2.0, -0.3, 8.0)),
+        ((3.0, 0.5, 3.6), (2.0, 0.0, -1.0)),
+    ):
+        pos, vel = torch.tensor(place, dtype=torch.float64), torch.tensor(velocity).double()
+        t = torch.arange(0.0, 3.0, 1e-3, dtype=torch.float64)[:, None]
+        path = pos + t * vel - torch.tensor((0.0, 0.0, 9.81 / 2)) * t * t
+        last = int((path[:, 2] > rim[2]).nonzero().max())
+        miss = float((path[last, :2] - rim[:2]).norm())
+        assert float(arrival(pos, vel, rim)) == pytest.approx(miss, abs=6e-3)
+    low = arrival(torch.tensor((0.4, 0.0, 1.7)), torch.tensor((4.0, 0.0, 5.0)), rim)
+    assert low == torch.inf

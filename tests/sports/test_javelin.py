@@ -24,8 +24,8 @@ HOLD, THROW, LATE = 5, 25, 60
 class Throw(HandMade):
     """A javelin wherever a test wants it."""
 
-    def __init__(self) -> None:
-        super().__init__("javelin")
+    def __init__(self, **options: object) -> None:
+        super().__init__("javelin", **options)
         scene = self.env.physics.scene
         self.q, self.v = scene.object_qpos("javelin"), scene.object_qvel("javelin")
         self.place((0.0, 0.0, STANDING))
@@ -127,6 +127,40 @@ def test_rewards_of_the_three_stages():
         terms = {k: float(v[0, 0]) for k, v in world.step().terms.items()}
         assert terms["goal"] == pytest.approx(0.9 * 1.0, abs=1e-5)
         assert terms["attitude"] == pytest.approx(0.1 * math.exp(-0.09) * late, abs=1e-4)
+
+
+def test_an_opening_hand_is_paid_once_it_need_not_hold():
+    """By the mean way of the fingertips from the line of the shaft, along which it may slide."""
+    world = Throw(let_go=10.0)
+    body = world.env.physics.scene.body
+    names = ("Index", "Middle", "Ring", "Pinky", "Thumb")
+    tips = [body.link_index(f"R_{name}3") for name in names]
+    along = torch.tensor((math.cos(UP), 0.0, math.sin(UP)))
+
+    def opening() -> float:
+        """Each tip's way less what of it is along the shaft, at most 0.1 m."""
+        physics = world.env.physics
+        way = physics.body_pos[0, 0, tips] - physics.object_pos[0, 0]
+        return float((way - (way @ along)[:, None] * along).norm(dim=-1).clamp(max=0.1).mean())
+
+    palm = world.palm()
+    world.javelin(tuple(palm.tolist()))
+    world.at(HOLD)
+    assert world.step(touched=20.0).terms["let_go"][0, 0] == 0.0
+    closed = opening()
+    assert 0.01 < closed < 0.095
+    world.env.view.clock[:] = THROW
+    world.javelin(tuple((palm + 0.2 * along).tolist()))  # slides
+    assert world.step(touched=20.0).terms["let_go"][0, 0] == pytest.approx(0.0, abs=1e-5)
+    world.javelin(tuple((palm + torch.tensor((0.0, 0.0, 0.03))).tolist()))
+    paid = float(world.step(touched=20.0).terms["let_go"][0, 0])
+    assert paid == pytest.approx(10.0 * max(opening() - closed, 0.0), abs=1e-4)
+    world.javelin(FAR)
+    paid += float(world.step().terms["let_go"][0, 0])
+    assert paid == pytest.approx(10.0 * (0.1 - closed), abs=1e-4)
+    assert world.step().terms["let_go"][0, 0] == 0.0
+    with pytest.raises(ValueError, match="must not be negative"):
+        make_env("javelin", num_worlds=1, options={"let_go": -1.0})
 
 
 @pytest.mark.parametrize(("away", "lost"), [(0.149, False), (0.151, True)])

@@ -15,8 +15,10 @@ BALL = (4.0, 0.0, 0.11)
 TARGET = (16.0, 1.0, 1.0)
 
 
-def kicker(root=(3.0, 0.14), target=TARGET, ball=BALL, vel=(0.0, 0.0, 0.0), clock=5) -> Pitch:
-    pitch = Pitch("penalty_kick")
+def kicker(
+    root=(3.0, 0.14), target=TARGET, ball=BALL, vel=(0.0, 0.0, 0.0), clock=5, **options
+) -> Pitch:
+    pitch = Pitch("penalty_kick", **options)
     pitch.stand(0, *root)
     pitch.ball(ball, vel)
     pitch.begin(clock, target=torch.tensor([target]))
@@ -77,6 +79,41 @@ def test_before_the_kick_walking_to_the_ball_pays():
     assert total(step)[0, 0] == pytest.approx(0.4 * gained, abs=1e-4)
     pitch.stand(0, 3.0, 0.14)
     assert pitch.advance().terms["approach"][0, 0] == pytest.approx(-0.4 * gained, abs=1e-4)
+
+
+def test_a_foot_is_led_to_the_ball_by_the_metre_and_once():
+    """By the nearer ankle, until the ball is kicked."""
+    pitch = kicker(reach=2.0)
+    body = pitch.env.physics.scene.body
+    ankles = [body.link_index(name) for name in ("L_Ankle", "R_Ankle")]
+
+    def nearest() -> float:
+        feet = pitch.env.physics.body_pos[0, 0, ankles] - torch.tensor(BALL)
+        return float(feet.norm(dim=-1).min())
+
+    begin = nearest()
+    paid = 0.0
+    for x in (3.2, 3.0, 3.4):
+        pitch.stand(0, x, 0.14)
+        paid += float(pitch.advance().terms["reach"][0, 0])
+    assert paid == pytest.approx(2.0 * (begin - nearest()), abs=1e-4)
+    pitch.stand(0, 3.5, 0.14)
+    assert pitch.advance("agent0/R_Toe").terms["reach"][0, 0] > 0.0
+    pitch.stand(0, 3.6, 0.14)
+    assert pitch.advance().terms["reach"][0, 0] == 0.0
+    assert "reach" not in kicker().advance().terms
+    with pytest.raises(ValueError, match="must not be negative"):
+        make_env("penalty_kick", num_worlds=1, options={"reach": -1.0})
+
+
+@pytest.mark.parametrize(("link", "pays"), [("R_Toe", True), ("Pelvis", False), ("L_Hand", False)])
+def test_a_touch_against_the_rules_pays_nothing_for_the_ball(link, pays):
+    """PPO slid into the ball with its pelvis for the reward of that one step (78 M samples)."""
+    pitch = kicker()
+    pitch.ball((4.3, 0.02, 0.2), (12.0, 1.0, 2.0))
+    terms = pitch.advance(f"agent0/{link}").terms
+    for name in ("progress", "speed", "aim"):
+        assert (float(terms[name][0, 0]) > 0.0) is pays, name
 
 
 def test_rounding_is_no_approach_of_the_ball():

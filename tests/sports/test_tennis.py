@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from sports import rackets, tennis
+from sports import rackets, table_tennis, tennis
 from sports.env import make_env, make_scene
 from sports.humanoid.mjcf import build_model
 from tests.sports.rackets_made import HandMadeRally, flights, launched, made, where_through
@@ -85,6 +85,43 @@ def aimed(x: float, y: float) -> tuple[float, float, float]:
     fan = np.stack((0 * up - 18.0, 0 * up + 18.0 * (y - 1.0) / (9.5 - x), up), 1)
     reached = where_through(flights("tennis", 0 * fan + (9.5, 1.0, 1.2), fan), 2, 0.032)[:, 0]
     return float(fan[0, 0]), float(fan[0, 1]), float(np.interp(-x, -reached, up))
+
+
+def test_a_stroke_is_paid_by_how_far_it_will_carry():
+    """In its step alone, by the share of the way from the ball to the target; a ball hit backwards
+    and a second contact earn nothing."""
+    world = rally(drive=3.0)
+    target = torch.tensor((-8.0, 3.0, 0.0))
+    world.env.memory["target"][:] = target
+    linvel = aimed(-9.0, 1.0)
+    step = stroke(world, linvel)
+    share = 1.0 - math.hypot(1.0, 2.0) / math.hypot(17.5, 2.0)
+    assert step.terms["drive"][0, 0] == pytest.approx(3.0 * share, abs=0.01)
+    assert world.go((9.0, 1.0, 1.4), linvel).terms["drive"][0, 0] == 0.0
+    assert stroke(world, linvel).terms["drive"][0, 0] == 0.0  # a second contact
+    assert stroke(rally(drive=3.0), (20.0, 0.0, 5.0)).terms["drive"][0, 0] == 0.0
+    assert "drive" not in stroke(rally()).terms
+
+
+@pytest.mark.parametrize("sport", ["tennis", "table_tennis"])
+def test_narrower_launches_are_those_of_the_sport_nearer_to_the_middle(sport):
+    rules = {"tennis": tennis.GAME, "table_tennis": table_tennis.GAME}[sport]
+    luck = torch.rand(400, 9, generator=torch.Generator().manual_seed(1))
+    every = torch.ones(400, dtype=torch.bool)
+    wide, narrow = (
+        rackets.served(rackets.narrowed(rules, width), luck, every) for width in (1.0, 0.25)
+    )
+    assert torch.equal(wide[0], rackets.served(rules, luck, every)[0])
+    torch.testing.assert_close(narrow[0][:, 1], 0.25 * wide[0][:, 1])
+    torch.testing.assert_close(narrow[0][:, [0, 2]], wide[0][:, [0, 2]])
+    env = make_env(sport, num_worlds=64, seed=1, options={"width": 0.1})
+    y = env.physics.object_pos[:, 0, 1].abs()
+    assert y.max() <= 0.1 * max(rules.serve.y[1], 1e-6) + 1e-6
+    for width in (0.0, 1.5):
+        with pytest.raises(ValueError, match="width"):
+            make_env(sport, num_worlds=1, options={"width": width})
+    with pytest.raises(ValueError, match="must not be negative"):
+        make_env(sport, num_worlds=1, options={"drive": -1.0})
 
 
 def test_after_contact_it_pays_how_near_to_the_target_the_ball_will_land():
