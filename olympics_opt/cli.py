@@ -161,7 +161,7 @@ class Render:
     out: Path | None = None
     """mp4 file for the video; with ``--all`` a png file."""
     sheet: Path | None = None
-    """png file for the sheet."""
+    """png file for the sheet, or jpg for one of half the width."""
     renderer: Literal["gl", "software"] = "gl"
     """``gl`` is MuJoCo's renderer; ``software`` needs no library and is slower."""
     engine: Literal["mujoco", "warp", "drake"] = "mujoco"

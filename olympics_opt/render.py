@@ -190,11 +190,11 @@ def render_sheet(
     columns: int | None = None,
     panel: tuple[int, int] | None = None,
 ) -> Path:
-    """Draws 12 frames of each recording on one PNG, without any GL library.
+    """Draws 12 frames of each recording on one picture, without any GL library.
 
     Args:
         recordings: episodes by label (``{"best": ..., "median": ...}``), or in that order.
-        path: PNG file, written atomically.
+        path: PNG file, or a JPEG (``.jpg``) of half the width for a page; written atomically.
         commit: the project's commit, printed with the seed.
         columns: panels in a row; by default as many as suit the sport.
         panel: width and height of a panel (pixels); likewise.
@@ -224,7 +224,11 @@ def render_sheet(
         sheet.paste(strip, (0, y))
         y += strip.height
     buffer = io.BytesIO()
-    sheet.save(buffer, "PNG", optimize=True)
+    if Path(path).suffix.lower() == ".jpg":
+        half = (sheet.width // 2, sheet.height // 2)
+        sheet.resize(half, Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=80)
+    else:
+        sheet.save(buffer, "PNG", optimize=True)
     return write_bytes(path, buffer.getvalue())
 
 

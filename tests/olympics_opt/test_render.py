@@ -215,6 +215,11 @@ def test_sheet_has_twelve_panels_for_each_recording(tmp_path: Path) -> None:
         blue = (part[..., 2] > part[..., 0] + 70).sum()
         red = (part[..., 0] > part[..., 2] + 70).sum()
         assert blue > 15 and red > 15, f"panel {i}"
+    small = Image.open(render.render_sheet({"best": episode}, tmp_path / "s.jpg", panel=(200, 140)))
+    assert small.format == "JPEG" and small.size == (2 * 200, (62 + 3 * 140) // 2)
+    likeness = np.asarray(image.convert("RGB").crop((0, 62, 800, 482)).resize((400, 210)))
+    gap = np.abs(likeness.astype(int) - np.asarray(small)[31:].astype(int))
+    assert gap.mean() < 4.0
     assert not list(tmp_path.glob("*.tmp"))
     with pytest.raises(ValueError, match="at least one"):
         render.render_sheet({}, tmp_path / "t.png")
