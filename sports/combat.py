@@ -6,7 +6,9 @@ one: a step in which both gloves land is one point.
 
 Sources: SMPLOlympics, section 4, for goal and reward; World Fencing (FIE) and World Boxing (AIBA)
 rules for what a touch is. A point is an event, not a state: after one, the weapon must leave the
-targets for half a second before the next, so that neither pushing nor holding pays.
+targets for half a second before the next, so that neither pushing nor holding pays. Who stays close
+to the opponent for a second holds: nothing that weapons do counts or pays until both have stepped
+apart, as after the referee's "break" (boxing) or "halt" for body contact (fencing).
 
 Shapes: N worlds, A = 2 athletes, B links, W weapons of each, K targets.
 """
@@ -34,6 +36,10 @@ TOUCH_DISTANCE_SQUARED = 0.1
 """Of the weapon's point from the target's origin (m^2), the paper's: 0.316 m."""
 REST = 0.5
 """Seconds without contact before the next point."""
+CLOSE, APART, HOLDING = 0.6, 0.9, 1.0
+"""Horizontal distance of the roots (m) below which athletes are close, that from which they have
+stepped apart, and the seconds of closeness from which they hold each other. Blows are struck from
+0.8 m and more."""
 FACING, VELOCITY, STRIKE, POINT = 0.1, 0.1, 0.6, 1.0
 """Weights of the reward's terms."""
 WANTED_SPEED = 1.0
@@ -146,7 +152,23 @@ def begin(view: View, weapons: tuple[Weapon, ...]) -> Memory:
     """Memory after a reset: nobody has scored, every weapon may."""
     squares = squared(gaps(view, weapons))
     nobody = torch.zeros_like(squares[:, :, 0, 0])
-    return {"squares": squares, "wait": nobody.clone(), "touches": nobody.clone()}
+    return {
+        "squares": squares,
+        "wait": nobody.clone(),
+        "touches": nobody.clone(),
+        "close_steps": nobody[:, 0].clone(),
+        "holding": nobody[:, 0] > 0.0,
+    }
+
+
+def clinch(view: View, memory: Memory) -> tuple[Tensor, Tensor]:
+    """(N,) steps for which the athletes have been close, and (N,) bool whether they hold each
+    other. PPO (20 M samples) learned to: a weapon near a target pays in every step."""
+    root = view.root_pos
+    way = squared((root[:, 1] - root[:, 0]) * constant((1.0, 1.0, 0.0), root.device))
+    close_steps = (memory["close_steps"] + 1.0).masked_fill(way >= CLOSE**2, 0.0)
+    long = close_steps * view.control_timestep >= HOLDING - 1e-6
+    return close_steps, (memory["holding"] | long) & (way < APART**2)
 
 
 def advance(
@@ -165,16 +187,19 @@ def advance(
     touch = ((force >= TOUCH_FORCE) & near).flatten(2).any(-1)
     contact = (force > 0.0).flatten(2).any(-1)
 
+    close_steps, holding = clinch(view, memory)
+    free = ~holding[:, None]
+
     wait = memory["wait"]  # steps without contact before the next point
     ready = wait <= 0
-    point = touch & ready
+    point = touch & ready & free
     rest = round(REST / view.control_timestep)
     wait = torch.where(point | (contact & ~ready), rest, (wait - 1).clamp(min=0))
     scored = point.float()
     touches = memory["touches"] + scored
 
     facing, velocity = approach(view)
-    strike = torch.exp(-10.0 * squares.flatten(2).amin(-1))
+    strike = torch.exp(-10.0 * squares.flatten(2).amin(-1)) * free
     terms = {
         "facing": FACING * facing,
         "velocity": VELOCITY * velocity,
@@ -196,7 +221,13 @@ def advance(
     for name, fault in faults.items():
         metrics[name], metrics[f"opponent_{name}"] = fault.float().unbind(1)
     return Advance(
-        memory={"squares": squares, "wait": wait, "touches": touches},
+        memory={
+            "squares": squares,
+            "wait": wait,
+            "touches": touches,
+            "close_steps": close_steps,
+            "holding": holding,
+        },
         terms=terms,
         terminated=ended,
         metrics=metrics,

@@ -242,6 +242,45 @@ def test_pushing_scores_once(task):
     assert points[:2] == [0.0, 1.0] and sum(points) == 1.0
 
 
+def test_who_holds_earns_nothing_until_both_have_stepped_apart(task):
+    """A second of closeness without a pause is holding; a little more distance does not end it."""
+
+    def place(distance: float) -> None:
+        for athlete in range(2):
+            bout.place(athlete, (athlete - 0.5) * distance, yaw=athlete * math.pi)
+
+    def at(distance: float, steps: int) -> None:
+        place(distance)
+        for _ in range(steps):
+            bout.step()
+
+    def struck(distance: float) -> tuple[bool, bool]:
+        """Whether nearness pays both there, and whether a blow is a point."""
+        bout.env.memory["wait"][:] = 0.0
+        bout.env.memory["squares"][:] = 0.01  # so that a blow is one at any distance
+        place(distance)
+        step = bout.step((0, 60.0))
+        paid = step.terms["strike"][0] > 0.0
+        assert paid[0] == paid[1]
+        return bool(paid[0]), bool(step.terms["point"][0, 0] > 0.0)
+
+    bout = Bout(task)
+    place(1.0)
+    bout.begin()
+    at(0.59, 29)
+    at(0.61, 1)
+    at(0.59, 28)
+    for distance, free in (
+        (0.59, True),
+        (0.59, False),  # a second
+        (0.7, False),
+        (0.89, False),
+        (0.91, True),
+        (0.59, True),
+    ):
+        assert struck(distance) == (free, free), distance
+
+
 def test_each_athlete_has_its_own_half_second(task):
     bout = Bout(task)
     bout.begin()
