@@ -1,0 +1,79 @@
+"""Learning curves for ``results/curves/``: a run's ``progress.csv`` thinned out, with its origin.
+
+``python -m rl.curves RUN OUT.json`` for a run here; a policy file with its card beside its curve
+(``NAME.safetensors``, ``NAME.json``, ``NAME.csv``) does as well.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from warmstart.atomic import write_json
+
+POINTS = 60
+"""Rows that are kept, the first and the last among them."""
+KEPT = ("samples", "minutes", "return", "episode_steps", "samples_per_s", "nan_worlds", "overflow")
+ORIGIN = ("task", "algo", "strength", "limits", "commit", "hardware", "versions", "config")
+
+
+def record_curve(
+    progress: str | Path, card: dict[str, Any], out: str | Path, points: int = POINTS
+) -> Path:
+    """Writes one curve.
+
+    Args:
+        progress: ``progress.csv`` of a run.
+        card: of the policy it ended with; its origin is copied.
+        out: JSON file, written atomically: the origin, and ``rows``, a list of numbers (null where
+            there was none) for each column: samples, minutes, mean return and length of episodes,
+            speed, broken worlds, and every metric and curriculum.
+        points: rows to keep, evenly spread.
+
+    Raises ValueError for a file without rows or columns of a curve.
+    """
+    with open(progress, newline="") as file:
+        rows = list(csv.DictReader(file))
+    if not rows or "samples" not in rows[0]:
+        raise ValueError(f"{progress} is no learning curve: it needs rows and a column 'samples'")
+    last = len(rows) - 1
+    picked = sorted({round(i * last / max(points - 1, 1)) for i in range(points)} | {last})
+    names = [k for k in rows[0] if k in KEPT or k.startswith(("metrics/", "curriculum/"))]
+    columns = {name: [_number(rows[i][name]) for i in picked] for name in names}
+    origin = {name: card[name] for name in ORIGIN if name in card}
+    return write_json(out, {"format": "olympics-opt curve 1", **origin, "rows": columns})
+
+
+def _number(text: str | None) -> float | None:
+    value = float(text) if text else math.nan
+    return value if math.isfinite(value) else None
+
+
+def main(args: Sequence[str]) -> int:
+    """The command; 2 for a mistake, told in a sentence."""
+    from rl.policy import export_policy
+
+    try:
+        if len(args) != 2:
+            raise ValueError("give a run's folder or a policy file, and the JSON file to write")
+        source, out = Path(args[0]), Path(args[1])
+        if source.is_dir():
+            policy = export_policy(source, source / "policy.safetensors")
+            progress = source / "progress.csv"
+        else:
+            policy, progress = source, source.with_suffix(".csv")
+        card = json.loads(policy.with_suffix(".json").read_text())
+        print(f"wrote {record_curve(progress, card, out)}")
+    except (ValueError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
