@@ -1,0 +1,196 @@
+"""Golf: a stroke off the tee with a prescribed club-head speed and loft, from chip to swing.
+
+The athlete stands where the task puts it, facing across the line of play, with the club in place
+of its right hand. It starts at rest at address, the head close behind the ball; takes the club
+back (``back``, until the head turns round), swings it down to the ball (``swing``) and follows
+through. At the impact the middle of the face is where the ball lies on its tee, moving at
+``club_speed``, its normal raised by ``loft``. The left hand goes along near the grip and holds
+nothing. Both feet stay where they stand; nothing but they touches the ground. The blow of the ball
+is not in the plan: it comes after the event and is felt in the replays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from sports import golf
+from sports.humanoid.body import Body, load_body
+from warmstart.contact import Ball
+from warmstart.phases import Phase
+from warmstart.problems import jumper, striker
+from warmstart.solution import Solution
+from warmstart.transcription import Transcription
+
+LINK = golf.TOOL
+FACE = (1.0, 0.0, 0.0)
+"""Its normal, in the frame of the hand."""
+AHEAD = golf.PLAYER_Y
+"""How far before the middle between the feet the ball lies (m)."""
+YAW = -math.pi / 2
+"""The athlete faces -y; play is along +x, to its left."""
+LYING = golf.TEE_HEIGHT + golf.BALL.radius
+"""Height of the ball's centre on its tee (m)."""
+MARGIN = 0.008
+"""What the head keeps off the ground at knots (m)."""
+BEHIND = (0.06, 0.15)
+"""How far behind the ball the face is at address (m): at least a ball and what the head sways."""
+FEET = {"L": "flat", "R": "flat"}
+BACK, SWING, FOLLOW = (0.40, 0.90), (0.22, 0.50), (0.30, 0.60)
+"""Durations (s) of the phases."""
+DURATIONS = (0.65, 0.35, 0.45)
+"""The same of a first guess."""
+LOFTS = (0.0, 14.0)
+"""Degrees. The head is a box 0.1 m deep: more tilted, it would dig in under a ball 5 cm up."""
+
+
+@dataclass(frozen=True)
+class Config(striker.Config):
+    """Options of the golf problem."""
+
+    club_speed: float = 9.0
+    """Speed of the middle of the face at the impact (m/s)."""
+    loft: float = 11.0
+    """Of the face's normal above the horizontal at the impact (degrees)."""
+    attack: float = 2.0
+    """Of the velocity of the face above the horizontal at the impact (degrees)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 3.0 <= self.club_speed <= 60.0:
+            raise ValueError(
+                f"club_speed must lie between 3 and 60 m/s, not {self.club_speed}: long drivers "
+                "reach 60 m/s"
+            )
+        if not LOFTS[0] <= self.loft <= LOFTS[1]:
+            raise ValueError(
+                f"loft must lie between {LOFTS[0]:g} and {LOFTS[1]:g} degrees, not {self.loft}: "
+                "the head would meet the ground"
+            )
+        if not -5.0 <= self.attack <= 15.0:
+            raise ValueError(f"attack must lie between -5 and 15 degrees, not {self.attack}")
+
+
+def face_point(body: Body) -> tuple[float, float, float]:
+    """The middle of the club's face, in the frame of the hand (m)."""
+    head = body.links[body.link_index(LINK)].shapes[1]
+    x, y, z = head.center
+    return (x + head.size[0], y, z)
+
+
+def head_corners(body: Body) -> list[Ball]:
+    """The corners of the club head, as balls without radius."""
+    head = body.links[body.link_index(LINK)].shapes[1]
+    corners = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T * np.array(head.size)
+    places = corners + np.array(head.center)
+    return [Ball(LINK, (float(x), float(y), float(z)), 0.0) for x, y, z in places]
+
+
+def club(body: Body) -> list[Ball]:
+    """Balls around shaft and head, for clearances."""
+    shaft, head = body.links[body.link_index(LINK)].shapes
+    assert shaft.end is not None
+    a, b = np.array(shaft.center), np.array(shaft.end)
+    places = [a + share * (b - a) for share in (0.35, 0.65)]
+    balls = [Ball(LINK, (float(x), float(y), float(z)), 0.02) for x, y, z in places]
+    return [*balls, Ball(LINK, head.center, max(head.size))]
+
+
+def make_event(config: Config, body: Body) -> striker.Event:
+    """What the face does at the impact."""
+    loft, attack = math.radians(config.loft), math.radians(config.attack)
+    normal = (0.0, math.cos(loft), math.sin(loft))
+    radius = golf.BALL.radius
+    return striker.Event(
+        LINK,
+        face_point(body),
+        FACE,
+        (AHEAD, -radius * normal[1], LYING - radius * normal[2]),
+        (0.0, config.club_speed * math.cos(attack), config.club_speed * math.sin(attack)),
+        normal,
+    )
+
+
+def transcribe(
+    config: Config, body: Body, event: striker.Event, elastic: bool = False
+) -> Transcription:
+    """The nonlinear program."""
+    knots = jumper.scaled(config.detail)
+    phases = [
+        Phase("back", knots(16), BACK, FEET),
+        Phase("swing", knots(24), SWING, FEET),
+        Phase("follow", knots(14), FOLLOW, FEET),
+    ]
+    program = striker.transcribe(
+        body,
+        event,
+        phases,
+        config,
+        position=POSITION,
+        tool=club(body),
+        feet=((0.35, 0.6), (-0.1, 0.1)),
+        elastic=elastic,
+    )
+    program.ground(head_corners(body), np.arange(program.K), MARGIN)
+    address(program, event)
+    return program
+
+
+def address(program: Transcription, event: striker.Event) -> None:
+    """The face behind the ball at the first knot; the head turns round at the end of ``back``."""
+    model = program.model
+    link, point = model.tree.link(LINK), event.point
+    x, y, z = event.place
+
+    def behind(q, p):
+        motion = model.motion(q)
+        here, normal = motion.point(link, point), motion.R_WL[link] @ ca.DM(list(event.axis))
+        return [
+            ("behind the ball", y - here[1], *BEHIND),
+            ("on the line", here[0] - x, -0.03, 0.03),
+            ("at its height", here[2] - z, -0.03, 0.03),
+            ("facing the target", normal[1], 0.95, np.inf),
+        ]
+
+    program.rows("address", [0], behind)
+
+    def still(q, v, p):
+        motion = model.motion(q, v)
+        return [("turns round", motion.point_velocity(link, point)[1] / 5.0, 0.0, 0.0)]
+
+    program.rows("top", [int(program.knots("back")[-1])], still, rates=True)
+
+
+POSITION = {
+    "R_Shoulder_z": (-0.9, 2.1),
+    "R_Elbow_z": (0.05, 2.4),
+    "R_Elbow_y": (-1.5, 1.5),
+    "R_Wrist_x": (-1.0, 1.0),
+}
+"""Pose boxes (rad) that differ from those of all strokes."""
+
+
+def solve(
+    config: Config,
+    guess: Solution | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> Solution:
+    """The least-effort stroke. See :meth:`warmstart.problems.Problem.solve`."""
+    body = load_body("smpl", strength=config.strength, equipment=["club"])
+    event = make_event(config, body)
+    return striker.solve(
+        "golf",
+        {"club_speed": config.club_speed},
+        event,
+        lambda elastic: transcribe(config, body, event, elastic),
+        lambda program: striker.key_guess(program, "golf", DURATIONS),
+        guess,
+        config,
+        progress,
+        f"a stroke of {config.club_speed:g} m/s with a loft of {config.loft:g} degrees",
+        (0.0, AHEAD, YAW),
+    )
