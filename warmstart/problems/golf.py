@@ -20,9 +20,11 @@ import numpy as np
 
 from sports import golf
 from sports.humanoid.body import Body, load_body
+from warmstart import tee_shot
 from warmstart.contact import Ball
 from warmstart.phases import Phase
 from warmstart.problems import jumper, striker
+from warmstart.separation import axis_balls
 from warmstart.solution import Solution
 from warmstart.transcription import Transcription
 
@@ -33,17 +35,27 @@ AHEAD = golf.PLAYER_Y
 """How far before the middle between the feet the ball lies (m)."""
 YAW = -math.pi / 2
 """The athlete faces -y; play is along +x, to its left."""
-LYING = golf.TEE_HEIGHT + golf.BALL.radius
-"""Height of the ball's centre on its tee (m)."""
 MARGIN = 0.008
 """What the head keeps off the ground at knots (m)."""
 BEHIND = (0.06, 0.15)
 """How far behind the ball the face is at address (m): at least a ball and what the head sways."""
 FEET = {"L": "flat", "R": "flat"}
-BACK, SWING, FOLLOW = (0.40, 0.90), (0.22, 0.50), (0.30, 0.60)
+BACK, SWING, FOLLOW = (0.40, 0.90), (0.22, 0.50), (0.45, 0.75)
 """Durations (s) of the phases."""
-DURATIONS = (0.65, 0.35, 0.45)
+DURATIONS = (0.80, 0.45, 0.50)
 """The same of a first guess."""
+GAP = (0.015, 0.045)
+"""Between the left hand and the right one (m)."""
+HANDS = (np.array([-0.15, 0.72]), np.array([0.10, 0.92]))
+"""Where the right hand may be at address: to the left of the middle, above the ground (m)."""
+FINISH = (np.array([0.10, 1.0]), np.array([0.8, 1.8]))
+"""The same at the end."""
+CLUB_UP = 0.8
+"""How high the head is at the end, at least (m)."""
+HEAD_UP = 1.25
+"""The same of the athlete's head."""
+UPRIGHT = {"pitch": (-0.2, 0.3), "roll": (-0.2, 0.2), "z": (0.82, 1.02)}
+"""Boxes of the root (rad, m) at the end."""
 LOFTS = (0.0, 14.0)
 """Degrees. The head is a box 0.1 m deep: more tilted, it would dig in under a ball 5 cm up."""
 
@@ -75,21 +87,6 @@ class Config(striker.Config):
             raise ValueError(f"attack must lie between -5 and 15 degrees, not {self.attack}")
 
 
-def face_point(body: Body) -> tuple[float, float, float]:
-    """The middle of the club's face, in the frame of the hand (m)."""
-    head = body.links[body.link_index(LINK)].shapes[1]
-    x, y, z = head.center
-    return (x + head.size[0], y, z)
-
-
-def head_corners(body: Body) -> list[Ball]:
-    """The corners of the club head, as balls without radius."""
-    head = body.links[body.link_index(LINK)].shapes[1]
-    corners = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T * np.array(head.size)
-    places = corners + np.array(head.center)
-    return [Ball(LINK, (float(x), float(y), float(z)), 0.0) for x, y, z in places]
-
-
 def club(body: Body) -> list[Ball]:
     """Balls around shaft and head, for clearances."""
     shaft, head = body.links[body.link_index(LINK)].shapes
@@ -107,9 +104,9 @@ def make_event(config: Config, body: Body) -> striker.Event:
     radius = golf.BALL.radius
     return striker.Event(
         LINK,
-        face_point(body),
+        tee_shot.face_point(body),
         FACE,
-        (AHEAD, -radius * normal[1], LYING - radius * normal[2]),
+        (AHEAD, -radius * normal[1], tee_shot.LYING - radius * normal[2]),
         (0.0, config.club_speed * math.cos(attack), config.club_speed * math.sin(attack)),
         normal,
     )
@@ -133,15 +130,21 @@ def transcribe(
         position=POSITION,
         tool=club(body),
         feet=((0.35, 0.6), (-0.1, 0.1)),
+        comfort=COMFORT,
         elastic=elastic,
     )
-    program.ground(head_corners(body), np.arange(program.K), MARGIN)
-    address(program, event)
+    corners = [
+        Ball(LINK, (float(x), float(y), float(z)), 0.0) for x, y, z in tee_shot.head_corners(body)
+    ]
+    program.ground(corners, np.arange(program.K), MARGIN)
+    shape(program, event)
+    hands_together(program, body)
     return program
 
 
-def address(program: Transcription, event: striker.Event) -> None:
-    """The face behind the ball at the first knot; the head turns round at the end of ``back``."""
+def shape(program: Transcription, event: striker.Event) -> None:
+    """The face behind the ball at the first knot, the hands low before the body; the head turns
+    round at the end of ``back``; hands and club are up on the target's side at the last knot."""
     model = program.model
     link, point = model.tree.link(LINK), event.point
     x, y, z = event.place
@@ -154,6 +157,7 @@ def address(program: Transcription, event: striker.Event) -> None:
             ("on the line", here[0] - x, -0.03, 0.03),
             ("at its height", here[2] - z, -0.03, 0.03),
             ("facing the target", normal[1], 0.95, np.inf),
+            ("hands at address", motion.p_WL[link][1:], *HANDS),
         ]
 
     program.rows("address", [0], behind)
@@ -164,14 +168,49 @@ def address(program: Transcription, event: striker.Event) -> None:
 
     program.rows("top", [int(program.knots("back")[-1])], still, rates=True)
 
+    def through(q, p):
+        motion = model.motion(q)
+        return [
+            ("hands through", motion.p_WL[link][1:], *FINISH),
+            ("club up", motion.point(link, point)[2], CLUB_UP, np.inf),
+            ("head up", motion.p_WL[model.tree.link("Head")][2], HEAD_UP, np.inf),
+        ]
+
+    program.rows("finish", [program.K - 1], through)
+    for name, (low, high) in UPRIGHT.items():
+        program.bound(program.q[-1, model.index(name)], low, high)
+
+
+def hands_together(program: Transcription, body: Body) -> None:
+    """The left hand stays beside the right one, as in a grip, without touching it."""
+    model = program.model
+    left, right = (axis_balls(body, "L_Hand")[-1], axis_balls(body, "R_Wrist", 3)[1])
+
+    def beside(q, p):
+        motion = model.motion(q)
+        a, b = (motion.point(model.tree.link(x.link), x.center) for x in (left, right))
+        low, high = (left.radius + right.radius + gap for gap in GAP)
+        return [("hands together", ca.sumsqr(a - b) / 0.05, low**2 / 0.05, high**2 / 0.05)]
+
+    program.rows("hands", np.arange(program.K), beside)
+
 
 POSITION = {
     "R_Shoulder_z": (-0.9, 2.1),
     "R_Elbow_z": (0.05, 2.4),
     "R_Elbow_y": (-1.5, 1.5),
     "R_Wrist_x": (-1.0, 1.0),
+    "L_Shoulder_x": (-1.45, 0.9),
+    "L_Shoulder_z": (-2.1, 0.9),
+    "L_Elbow_z": (-2.4, 0.0),
+    "Torso_y": (-0.25, 0.6),
+    "Chest_y": (-0.2, 0.5),
 }
 """Pose boxes (rad) that differ from those of all strokes."""
+COMFORT = {"pitch": 0.3, "roll": 0.0, "Torso_x": 0.0, "Torso_y": 0.15, "Chest_y": 0.1} | {
+    f"{side}_Hip_{axis}": 0.0 for side in "LR" for axis in "xz"
+}
+"""Angles (rad) to which a small price draws the posture: bent forward from the hips."""
 
 
 def solve(
