@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -23,7 +23,7 @@ from sports.humanoid.body import Body, load_body
 from warmstart import tee_shot
 from warmstart.contact import Ball
 from warmstart.phases import Phase
-from warmstart.problems import jumper, striker
+from warmstart.problems import clearance, jumper, striker
 from warmstart.separation import axis_balls
 from warmstart.solution import Solution
 from warmstart.transcription import Transcription
@@ -40,12 +40,14 @@ MARGIN = 0.008
 BEHIND = (0.06, 0.15)
 """How far behind the ball the face is at address (m): at least a ball and what the head sways."""
 FEET = {"L": "flat", "R": "flat"}
-BACK, SWING, FOLLOW = (0.40, 0.90), (0.22, 0.50), (0.45, 0.75)
+BACK, SWING, FOLLOW = (0.40, 0.65), (0.22, 0.40), (0.45, 0.75)
 """Durations (s) of the phases."""
-DURATIONS = (0.80, 0.45, 0.50)
+DURATIONS = (0.65, 0.35, 0.50)
 """The same of a first guess."""
-GAP = (0.015, 0.045)
-"""Between the left hand and the right one (m)."""
+GAP = (0.025, 0.055)
+"""Between the ball of the left hand and the right one (m)."""
+CORNERS = 0.025
+"""How far the corners of the left hand stick out of its ball (m)."""
 HANDS = (np.array([-0.15, 0.72]), np.array([0.10, 0.92]))
 """Where the right hand may be at address: to the left of the middle, above the ground (m)."""
 FINISH = (np.array([0.10, 1.0]), np.array([0.8, 1.8]))
@@ -56,6 +58,12 @@ HEAD_UP = 1.25
 """The same of the athlete's head."""
 UPRIGHT = {"pitch": (-0.2, 0.3), "roll": (-0.2, 0.2), "z": (0.82, 1.02)}
 """Boxes of the root (rad, m) at the end."""
+STANCE = ((0.45, 0.65), (-0.05, 0.05))
+"""How far the left foot stands to the left of and ahead of the right one (m)."""
+BOTH = 0.2
+"""Share of body weight that each foot carries at least: who stands on one topples in a replay."""
+SHEAR = 600.0
+"""Weight of horizontal force on the feet."""
 LOFTS = (0.0, 14.0)
 """Degrees. The head is a box 0.1 m deep: more tilted, it would dig in under a ball 5 cm up."""
 
@@ -118,9 +126,9 @@ def transcribe(
     """The nonlinear program."""
     knots = jumper.scaled(config.detail)
     phases = [
-        Phase("back", knots(16), BACK, FEET),
-        Phase("swing", knots(24), SWING, FEET),
-        Phase("follow", knots(14), FOLLOW, FEET),
+        Phase("back", knots(12), BACK, FEET),
+        Phase("swing", knots(18), SWING, FEET),
+        Phase("follow", knots(11), FOLLOW, FEET),
     ]
     program = striker.transcribe(
         body,
@@ -129,7 +137,8 @@ def transcribe(
         config,
         position=POSITION,
         tool=club(body),
-        feet=((0.35, 0.6), (-0.1, 0.1)),
+        feet=STANCE,
+        shear=SHEAR,
         comfort=COMFORT,
         elastic=elastic,
     )
@@ -139,6 +148,7 @@ def transcribe(
     program.ground(corners, np.arange(program.K), MARGIN)
     shape(program, event)
     hands_together(program, body)
+    both_feet(program)
     return program
 
 
@@ -182,9 +192,13 @@ def shape(program: Transcription, event: striker.Event) -> None:
 
 
 def hands_together(program: Transcription, body: Body) -> None:
-    """The left hand stays beside the right one, as in a grip, without touching it."""
+    """The left hand stays beside the right one, as in a grip, without touching the right arm."""
     model = program.model
     left, right = (axis_balls(body, "L_Hand")[-1], axis_balls(body, "R_Wrist", 3)[1])
+    wide = replace(left, radius=left.radius + CORNERS)
+    arm, near = axis_balls(body, "R_Elbow", 3), axis_balls(body, "L_Wrist")
+    pairs = [(wide, b) for b in arm] + [(a, b) for a in near for b in (*arm, right)]
+    clearance.keep_off(program, pairs, np.arange(program.K), 0.005)
 
     def beside(q, p):
         motion = model.motion(q)
@@ -193,6 +207,18 @@ def hands_together(program: Transcription, body: Body) -> None:
         return [("hands together", ca.sumsqr(a - b) / 0.05, low**2 / 0.05, high**2 / 0.05)]
 
     program.rows("hands", np.arange(program.K), beside)
+
+
+def both_feet(program: Transcription) -> None:
+    """Each foot carries its share of the weight."""
+    least = BOTH * program.weight
+    for side, forces in program.f.items():
+        up = np.array([index[:, 2] for index in forces.values()])
+
+        def carried(f, p):
+            return 0.0, [("weight on both feet", ca.sum1(f) / least, 1.0, np.inf)]
+
+        program.program.block(f"load {side}", [up], carried)
 
 
 POSITION = {
