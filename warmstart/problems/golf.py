@@ -60,9 +60,12 @@ UPRIGHT = {"pitch": (-0.2, 0.3), "roll": (-0.2, 0.2), "z": (0.82, 1.02)}
 """Boxes of the root (rad, m) at the end."""
 STANCE = ((0.45, 0.65), (-0.05, 0.05))
 """How far the left foot stands to the left of and ahead of the right one (m)."""
-BOTH = 0.2
+BOTH = 0.3
 """Share of body weight that each foot carries at least: who stands on one topples in a replay."""
-SHEAR = 600.0
+SPREAD = 0.02
+"""Cost at one knot of the squared load of a sole point over body weight: a plan that stands on the
+edge of a sole rolls over it in an engine, whose ground is soft."""
+SHEAR = 2000.0
 """Weight of horizontal force on the feet."""
 LOFTS = (0.0, 14.0)
 """Degrees. The head is a box 0.1 m deep: more tilted, it would dig in under a ball 5 cm up."""
@@ -194,29 +197,30 @@ def shape(program: Transcription, event: striker.Event) -> None:
 def hands_together(program: Transcription, body: Body) -> None:
     """The left hand stays beside the right one, as in a grip, without touching the right arm."""
     model = program.model
-    left, right = (axis_balls(body, "L_Hand")[-1], axis_balls(body, "R_Wrist", 3)[1])
+    left, wrist = axis_balls(body, "L_Hand")[-1], axis_balls(body, "R_Wrist", 3)
     wide = replace(left, radius=left.radius + CORNERS)
     arm, near = axis_balls(body, "R_Elbow", 3), axis_balls(body, "L_Wrist")
-    pairs = [(wide, b) for b in arm] + [(a, b) for a in near for b in (*arm, right)]
+    pairs = [(wide, b) for b in arm] + [(a, b) for a in near for b in (*arm, *wrist)]
     clearance.keep_off(program, pairs, np.arange(program.K), 0.005)
 
     def beside(q, p):
         motion = model.motion(q)
-        a, b = (motion.point(model.tree.link(x.link), x.center) for x in (left, right))
-        low, high = (left.radius + right.radius + gap for gap in GAP)
+        a, b = (motion.point(model.tree.link(x.link), x.center) for x in (left, wrist[1]))
+        low, high = (left.radius + wrist[1].radius + gap for gap in GAP)
         return [("hands together", ca.sumsqr(a - b) / 0.05, low**2 / 0.05, high**2 / 0.05)]
 
     program.rows("hands", np.arange(program.K), beside)
 
 
 def both_feet(program: Transcription) -> None:
-    """Each foot carries its share of the weight."""
+    """Each foot carries its share of the weight, and by a small price evenly over its sole."""
     least = BOTH * program.weight
     for side, forces in program.f.items():
         up = np.array([index[:, 2] for index in forces.values()])
 
         def carried(f, p):
-            return 0.0, [("weight on both feet", ca.sum1(f) / least, 1.0, np.inf)]
+            price = SPREAD * ca.sumsqr(f / program.weight)
+            return price, [("weight on both feet", ca.sum1(f) / least, 1.0, np.inf)]
 
         program.program.block(f"load {side}", [up], carried)
 
