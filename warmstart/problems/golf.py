@@ -54,10 +54,17 @@ FINISH = (np.array([0.10, 1.0]), np.array([0.8, 1.8]))
 """The same at the end."""
 CLUB_UP = 0.8
 """How high the head is at the end, at least (m)."""
-HEAD_UP = 1.25
+HEAD_UP = 1.4
 """The same of the athlete's head."""
-UPRIGHT = {"pitch": (-0.2, 0.3), "roll": (-0.2, 0.2), "z": (0.82, 1.02)}
-"""Boxes of the root (rad, m) at the end."""
+UPRIGHT = {
+    "z": (0.82, 1.02),
+    "pitch": (-0.1, 0.3),
+    "roll": (-0.15, 0.15),
+    "Torso_x": (-0.12, 0.12),
+    "Torso_y": (-0.15, 0.25),
+    "Chest_y": (-0.1, 0.2),
+}
+"""Boxes of root and trunk (m, rad) at the end."""
 STANCE = ((0.45, 0.65), (-0.05, 0.05))
 """How far the left foot stands to the left of and ahead of the right one (m)."""
 BOTH = 0.3
