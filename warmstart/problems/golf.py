@@ -44,12 +44,14 @@ BACK, SWING, FOLLOW = (0.40, 0.65), (0.22, 0.40), (0.45, 0.75)
 """Durations (s) of the phases."""
 DURATIONS = (0.65, 0.35, 0.50)
 """The same of a first guess."""
-GAP = (0.025, 0.055)
+GAP = (0.03, 0.06)
 """Between the ball of the left hand and the right one (m)."""
 CORNERS = 0.025
 """How far the corners of the left hand stick out of its ball (m)."""
 HANDS = (np.array([-0.15, 0.72]), np.array([0.10, 0.92]))
 """Where the right hand may be at address: to the left of the middle, above the ground (m)."""
+OVER = (-0.25, 0.15)
+"""How far to the left of the ball the right hand may be at the impact (m)."""
 FINISH = (np.array([0.10, 1.0]), np.array([0.8, 1.8]))
 """The same at the end."""
 CLUB_UP = 0.8
@@ -67,6 +69,8 @@ UPRIGHT = {
 """Boxes of root and trunk (m, rad) at the end."""
 STANCE = ((0.45, 0.65), (-0.05, 0.05))
 """How far the left foot stands to the left of and ahead of the right one (m)."""
+FLARE = {"L": (-0.1, 0.4), "R": (-0.4, 0.1)}
+"""Sine of the angle by which a foot points to the left of straight ahead."""
 BOTH = 0.3
 """Share of body weight that each foot carries at least: who stands on one topples in a replay."""
 SPREAD = 0.02
@@ -178,6 +182,10 @@ def shape(program: Transcription, event: striker.Event) -> None:
             ("at its height", here[2] - z, -0.03, 0.03),
             ("facing the target", normal[1], 0.95, np.inf),
             ("hands at address", motion.p_WL[link][1:], *HANDS),
+            *(
+                (f"{side} foot square", motion.R_WL[model.tree.link(f"{side}_Ankle")][1, 0], *turned)
+                for side, turned in FLARE.items()
+            ),
         ]
 
     program.rows("address", [0], behind)
@@ -187,6 +195,11 @@ def shape(program: Transcription, event: striker.Event) -> None:
         return [("turns round", motion.point_velocity(link, point)[1] / 5.0, 0.0, 0.0)]
 
     program.rows("top", [int(program.knots("back")[-1])], still, rates=True)
+
+    def over(q, p):
+        return [("hands over the ball", model.motion(q).p_WL[link][1], *OVER)]
+
+    program.rows("over the ball", [int(program.knots("swing")[-1])], over)
 
     def through(q, p):
         motion = model.motion(q)
