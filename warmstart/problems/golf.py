@@ -38,7 +38,7 @@ YAW = -math.pi / 2
 MARGIN = 0.008
 """What the head keeps off the ground at knots (m)."""
 BEHIND = (0.06, 0.15)
-"""How far behind the ball the face is at address (m): at least a ball and what the head sways."""
+"""How far behind its place at the impact the face is at address (m)."""
 FEET = {"L": "flat", "R": "flat"}
 BACK, SWING, FOLLOW = (0.40, 0.65), (0.22, 0.40), (0.45, 0.75)
 """Durations (s) of the phases."""
@@ -49,15 +49,14 @@ GAP = (0.03, 0.06)
 CORNERS = 0.025
 """How far the corners of the left hand stick out of its ball (m)."""
 HANDS = (np.array([-0.15, 0.72]), np.array([0.10, 0.92]))
-"""Where the right hand may be at address: to the left of the middle, above the ground (m)."""
+"""Where the right hand may be at address, lowest and highest: to the left of the middle and above
+the ground (m)."""
 OVER = (-0.25, 0.15)
-"""How far to the left of the ball the right hand may be at the impact (m)."""
+"""How far to the left of the ball it may be at the impact (m): it does not trail far behind."""
 FINISH = (np.array([0.10, 1.0]), np.array([0.8, 1.8]))
-"""The same at the end."""
-CLUB_UP = 0.8
-"""How high the head is at the end, at least (m)."""
-HEAD_UP = 1.4
-"""The same of the athlete's head."""
+"""Where it may be at the end: to the left of the middle, above the ground (m)."""
+CLUB_UP, HEAD_UP = 0.8, 1.4
+"""How high the head of the club and that of the athlete are at the end, at least (m)."""
 UPRIGHT = {
     "z": (0.82, 1.02),
     "pitch": (-0.1, 0.3),
@@ -162,7 +161,7 @@ def transcribe(
     program.ground(corners, np.arange(program.K), MARGIN)
     shape(program, event)
     hands_together(program, body)
-    both_feet(program)
+    both_feet(program, SPREAD / config.detail)
     return program
 
 
@@ -171,6 +170,7 @@ def shape(program: Transcription, event: striker.Event) -> None:
     round at the end of ``back``; hands and club are up on the target's side at the last knot."""
     model = program.model
     link, point = model.tree.link(LINK), event.point
+    feet = {side: model.tree.link(f"{side}_Ankle") for side in FLARE}
     x, y, z = event.place
 
     def behind(q, p):
@@ -182,10 +182,7 @@ def shape(program: Transcription, event: striker.Event) -> None:
             ("at its height", here[2] - z, -0.03, 0.03),
             ("facing the target", normal[1], 0.95, np.inf),
             ("hands at address", motion.p_WL[link][1:], *HANDS),
-            *(
-                (f"{side} foot square", motion.R_WL[model.tree.link(f"{side}_Ankle")][1, 0], *turned)
-                for side, turned in FLARE.items()
-            ),
+            *((f"{s} foot square", motion.R_WL[i][1, 0], *FLARE[s]) for s, i in feet.items()),
         ]
 
     program.rows("address", [0], behind)
@@ -232,15 +229,15 @@ def hands_together(program: Transcription, body: Body) -> None:
     program.rows("hands", np.arange(program.K), beside)
 
 
-def both_feet(program: Transcription) -> None:
-    """Each foot carries its share of the weight, and by a small price evenly over its sole."""
+def both_feet(program: Transcription, price: float) -> None:
+    """Each foot carries its share of the weight, and by a ``price`` evenly over its sole."""
     least = BOTH * program.weight
     for side, forces in program.f.items():
         up = np.array([index[:, 2] for index in forces.values()])
 
         def carried(f, p):
-            price = SPREAD * ca.sumsqr(f / program.weight)
-            return price, [("weight on both feet", ca.sum1(f) / least, 1.0, np.inf)]
+            rows = [("weight on both feet", ca.sum1(f) / least, 1.0, np.inf)]
+            return price * ca.sumsqr(f / program.weight), rows
 
         program.program.block(f"load {side}", [up], carried)
 
