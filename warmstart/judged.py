@@ -96,22 +96,21 @@ def _javelin(solution: Solution, found: Moment) -> dict[str, float]:
 
 def _golf() -> Checks:
     """Checks of a stroke off the tee."""
-    ball = (("speed", "m/s"), ("launch angle", "deg"), ("carry", "m"), ("aside", "m"))
+    ball = (("launch speed", "m/s"), ("launch angle", "deg"), ("carry", "m"), ("aside", "m"))
     face = (("loft", "deg"), ("attack", "deg"))
     out: Checks = {
         "planned loft off": ("<=", 0.5, "deg"),
         "planned head over the ground": (">=", 0.0, "m"),
     }
     for head in ("planned ", "replay in mujoco: ", "replay in drake: "):
-        out |= {f"{head}{name}": (*_RECORDED, unit) for name, unit in face}
-        out |= {f"{head}ball {name}": (*_RECORDED, unit) for name, unit in ball}
+        out |= {f"{head}{name}": (*_RECORDED, unit) for name, unit in face + ball}
     for head in ("replay in mujoco: ", "replay in drake: "):
         out |= {
             f"{head}loft off": ("<=", 3.0, "deg"),
             f"{head}head over the ground": (">=", 0.0, "m"),
-            f"{head}ball: speed": (">=", tee_shot.GOES, "m/s"),
+            f"{head}ball: launch speed off": ("<=", 0.10, "of the planned speed"),
         }
-        out |= {f"{head}ball: {name}": (*_RECORDED, unit) for name, unit in ball[1:]}
+        out |= {f"{head}ball: {name}": (*_RECORDED, unit) for name, unit in ball}
     return out
 
 

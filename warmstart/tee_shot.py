@@ -19,7 +19,7 @@ from warmstart import rotation, shot
 from warmstart.outcome import link_poses
 from warmstart.replay import replay_states
 from warmstart.solution import Solution
-from warmstart.strike import Moment
+from warmstart.strike import AROUND, Moment, moment
 
 LAW = "golf"
 LYING = golf.TEE_HEIGHT + golf.BALL.radius
@@ -70,14 +70,14 @@ def struck(body: Body, found: Moment, point: np.ndarray) -> shot.Ball:
 
 
 def flight(ball: shot.Ball) -> dict[str, float]:
-    """Speed (m/s) and launch angle (degrees) of a struck ball; where it first meets the turf, along
+    """Launch speed (m/s) and angle (degrees) of a struck ball; where it first meets the turf, along
     the line of play (``carry``) and to the left of it (``aside``), m. All 0 of one that was not
     struck."""
     speed = float(np.linalg.norm(ball.linvel))
     landed = shot.until(LAW, ball, 2, golf.BALL.radius, -1.0) if speed > GOES else None
     carry, aside = (0.0, 0.0) if landed is None else (float(x) for x in landed.pos[:2])
     angle = math.degrees(math.asin(ball.linvel[2] / speed)) if speed > GOES else 0.0
-    return {"speed": speed, "launch angle": angle, "carry": carry, "aside": aside}
+    return {"launch speed": speed, "launch angle": angle, "carry": carry, "aside": aside}
 
 
 # What becomes of the ball of a solved stroke.
@@ -95,13 +95,14 @@ def followed(solution: Solution, found: Moment) -> dict[str, float]:
         "loft": loft,
         "loft off": abs(loft - asked),
         "attack": _elevation(found.velocity),
-        **{f"ball {name}": value for name, value in ball.items()},
+        **ball,
     }
 
 
 def played(solution: Solution, engine: str) -> dict[str, float]:
     """The ball's :func:`flight` after a replay in which it lies on its tee in the engine, blow and
-    recoil included, and what the head keeps off the ground in it (m)."""
+    recoil included; by how much its launch speed is off the planned one, over it: who meets it with
+    the edge of the face sends it elsewhere; and what the head keeps off the ground (m)."""
     qpos = np.array([0.0, 0.0, LYING, 1.0, 0.0, 0.0, 0.0])
     _, where, rates = replay_states(
         solution, engine, 0.0, scene(solution.body), (qpos, np.zeros(6))
@@ -110,11 +111,22 @@ def played(solution: Solution, engine: str) -> dict[str, float]:
     gone = np.flatnonzero(np.linalg.norm(rates[:, spin : spin + 3], axis=1) > GOES)
     k = min(int(gone[0]) + 1, len(where) - 1) if gone.size else 0  # the step of the impact is over
     turning = rotation.rotate(where[k, at + 3 : at + 7], rates[k, spin + 3 : spin + 6])
-    ball = shot.Ball(0.0, where[k, at : at + 3], rates[k, spin : spin + 3], turning)
+    ball = flight(shot.Ball(0.0, where[k, at : at + 3], rates[k, spin : spin + 3], turning))
+    planned = flight(_planned(solution))["launch speed"]
     return {
         "head over the ground": over_the_ground(solution.body, where[:, :at]),
-        **{f"ball: {name}": value for name, value in flight(ball).items()},
+        "ball: launch speed off": abs(ball["launch speed"] / planned - 1.0),
+        **{f"ball: {name}": value for name, value in ball.items()},
     }
+
+
+def _planned(solution: Solution) -> shot.Ball:
+    """The ball right after the planned impact."""
+    event = solution.stats["event"]
+    times = event["time"] + np.linspace(-AROUND, AROUND, 101)
+    qpos = solution.sample(solution.times[0] + times)["qpos"]
+    found = moment(solution.body, event, times, qpos, nearest=False)
+    return struck(solution.body, found, np.array(event["point"]))
 
 
 def swept(solution: Solution, rate: float = 480.0) -> dict[str, float]:
