@@ -12,7 +12,7 @@ is not in the plan: it comes after the event and is felt in the replays.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -108,12 +108,12 @@ class Config(striker.Config):
             raise ValueError(f"attack must lie between -5 and 15 degrees, not {self.attack}")
 
 
-def club(body: Body, shares: Sequence[float] = (0.35, 0.65)) -> list[Ball]:
-    """Balls around the shaft, at ``shares`` of its length, and the head, for clearances."""
+def club(body: Body) -> list[Ball]:
+    """Balls around shaft and head, for clearances."""
     shaft, head = body.links[body.link_index(LINK)].shapes
     assert shaft.end is not None
     a, b = np.array(shaft.center), np.array(shaft.end)
-    places = [a + share * (b - a) for share in shares]
+    places = [a + share * (b - a) for share in (0.35, 0.65)]
     balls = [Ball(LINK, (float(x), float(y), float(z)), 0.02) for x, y, z in places]
     return [*balls, Ball(LINK, head.center, max(head.size))]
 
@@ -161,7 +161,6 @@ def transcribe(
     program.ground(corners, np.arange(program.K), MARGIN)
     shape(program, event)
     hands_together(program, body)
-    off_the_legs(program, body)
     both_feet(program, SPREAD / config.detail)
     return program
 
@@ -228,14 +227,6 @@ def hands_together(program: Transcription, body: Body) -> None:
         return [("hands together", ca.sumsqr(a - b) / 0.05, low**2 / 0.05, high**2 / 0.05)]
 
     program.rows("hands", np.arange(program.K), beside)
-
-
-def off_the_legs(program: Transcription, body: Body) -> None:
-    """Shaft and head pass before shins and feet."""
-    links = [f"{side}_{name}" for side in "LR" for name in ("Knee", "Ankle", "Toe")]
-    legs = [ball for link in links for ball in axis_balls(body, link)]
-    pairs = [(a, b) for a in club(body, (0.55, 0.75, 0.9)) for b in legs]
-    clearance.keep_off(program, pairs, np.arange(program.K), clearance.TOOL_ROOM)
 
 
 def both_feet(program: Transcription, price: float) -> None:
