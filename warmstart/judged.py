@@ -12,7 +12,7 @@ from sports.humanoid.body import Body
 from sports.humanoid.mjcf import build_model
 from sports.rackets import Game
 from sports.scene import Scene
-from warmstart import shot, thrown
+from warmstart import shot, tee_shot, thrown
 from warmstart.solution import Solution
 from warmstart.strike import Moment, Rules
 
@@ -94,7 +94,36 @@ def _javelin(solution: Solution, found: Moment) -> dict[str, float]:
     }
 
 
+def _golf() -> Checks:
+    """Checks of a stroke off the tee."""
+    ball = (("launch speed", "m/s"), ("launch angle", "deg"), ("carry", "m"), ("aside", "m"))
+    face = (("loft", "deg"), ("attack", "deg"))
+    out: Checks = {
+        "planned loft off": ("<=", 0.5, "deg"),
+        "planned head over the ground": (">=", 0.0, "m"),
+    }
+    for head in ("planned ", "replay in mujoco: ", "replay in drake: "):
+        out |= {f"{head}{name}": (*_RECORDED, unit) for name, unit in face + ball}
+    for head in ("replay in mujoco: ", "replay in drake: "):
+        out |= {
+            f"{head}loft off": ("<=", 3.0, "deg"),
+            f"{head}head over the ground": (">=", 0.0, "m"),
+            f"{head}ball: launch speed off": ("<=", 0.10, "of the planned speed"),
+        }
+        out |= {f"{head}ball: {name}": (*_RECORDED, unit) for name, unit in ball}
+    return out
+
+
 RULES: dict[str, Rules] = {
+    "golf": Rules(
+        "club_speed",
+        "m/s",
+        nearest=True,
+        follow=tee_shot.followed,
+        play=tee_shot.played,
+        also=tee_shot.swept,
+        checks=_golf(),
+    ),
     "javelin": Rules(
         "release_speed",
         "m/s",

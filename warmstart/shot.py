@@ -149,15 +149,15 @@ def state_at(law: str, game: Game, launched: Ball, time: float) -> Ball:
     return flown(law, bounced(law, down), time - down.time)
 
 
-def racket_numbers(scene: Scene) -> np.ndarray:
-    """(TOOL_NUMBERS,) of the racket of a scene, as the law reads them."""
+def tool_numbers(scene: Scene) -> np.ndarray:
+    """(TOOL_NUMBERS,) of the racket or club of a scene, as the law reads them."""
     from sports.humanoid.mjcf import build_model
 
     return build_game(scene, build_model(scene), 1).tools[0]
 
 
 def impact(
-    game: Game,
+    law: str,
     ball: Ball,
     face_velocity: np.ndarray,
     normal: np.ndarray,
@@ -165,13 +165,13 @@ def impact(
     rotation: np.ndarray,
     contact: np.ndarray,
 ) -> Ball:
-    """The ball after a racket has met it.
+    """The ball after a racket or club has met it.
 
-    ``face_velocity`` (3,) of the face at the contact, ``normal`` (3,) unit towards the ball;
-    ``tool``: :func:`racket_numbers`, ``rotation`` (3, 3) R_world_tool, ``contact`` (3,) in the
-    tool's frame (m).
+    ``law`` names the kind of ball; ``face_velocity`` (3,) of the face at the contact, ``normal``
+    (3,) unit towards the ball; ``tool``: :func:`tool_numbers`, ``rotation`` (3, 3) R_world_tool,
+    ``contact`` (3,) in the tool's frame (m).
     """
-    kind = ball_of(game.law)
+    kind = ball_of(law)
     numbers, n = kind.numbers(), rotation.T @ normal
     slip = ball.linvel - kind.radius * np.cross(ball.angvel, normal) - face_velocity
     diagonal, mixed = flight.ball_matrix(tuple(n), numbers)
@@ -236,7 +236,7 @@ def stroke_to(
         elevation, aside, pace = x
         n = _direction(elevation, yaw + aside)
         velocity = pace * _direction(elevation + brush, yaw + aside)
-        return n, velocity, impact(game, ball, velocity, n, tool, attitude(n), contact)
+        return n, velocity, impact(game.law, ball, velocity, n, tool, attitude(n), contact)
 
     def miss(x: np.ndarray) -> np.ndarray:
         struck = strike(x)[2]
@@ -297,11 +297,11 @@ def followed(game: Game, scene: Scene, solution: Solution, found: Moment) -> dic
     launched = _launched(told)
     met = state_at(game.law, game, launched, told["met"])
     struck = impact(
-        game,
+        game.law,
         met,
         found.velocity,
         found.normal,
-        racket_numbers(scene),
+        tool_numbers(scene),
         found.rotation,
         np.array(event["point"]),
     )

@@ -46,7 +46,7 @@ def throw() -> Solution:
 @pytest.fixture(scope="module")
 def racket() -> np.ndarray:
     body = load_body("smpl", strength="human", equipment=["racket"])
-    return shot.racket_numbers(tennis.scene(body))
+    return shot.tool_numbers(tennis.scene(body))
 
 
 # The ball's way.
@@ -81,7 +81,7 @@ def test_a_central_blow_conserves_momentum_and_gives_back_restitution(mass):
     tool = np.zeros(10)
     tool[0], tool[1:4], tool[4:7] = mass, (0.1, 0.0, 0.0), 1.0 / (mass * 0.01)
     u, normal = np.array([-15.0, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0])
-    after = shot.impact(GAME, ball, u, normal, tool, np.eye(3), np.array([0.1, 0.0, 0.0]))
+    after = shot.impact(GAME.law, ball, u, normal, tool, np.eye(3), np.array([0.1, 0.0, 0.0]))
     m, e = BALLS["tennis"].mass, BALLS["tennis"].tool_restitution
     common = (m * 7.0 + mass * -15.0) / (m + mass)
     own = common - e * mass / (m + mass) * (7.0 + 15.0)

@@ -94,6 +94,14 @@ PROBLEMS: dict[str, Problem] = {
             module="warmstart.problems.javelin",
         ),
         Problem(
+            name="golf",
+            summary="stroke off the tee, from chip to swing, at a given club-head speed and loft",
+            outcome="club_speed",
+            unit="m/s",
+            sweep=(6.0, 9.0, 12.0),
+            module="warmstart.problems.golf",
+        ),
+        Problem(
             name="hurdling",
             summary="one stride over a hurdle of given height at a given run speed",
             outcome="hurdle_height",

@@ -127,7 +127,7 @@ def aim(sport: Sport, config: Config, body: Body) -> Aim:
         )
     face = (0.0, 0.0, sign)
     point = (0.0, -game.reach, sign * sport.half_thickness)
-    tool = shot.racket_numbers(sport.scene(body))
+    tool = shot.tool_numbers(sport.scene(body))
     stroke = shot.stroke_to(
         game, ball, config.target, config.ball_speed, config.brush, tool, face, np.array(point)
     )

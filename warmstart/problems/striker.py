@@ -202,6 +202,7 @@ def transcribe(
     feet: tuple[tuple[float, float], tuple[float, float]] = ((0.4, 0.75), (-0.3, 0.3)),
     bounds: Mapping[str, float] | None = None,
     shear: float = SHEAR,
+    comfort: Mapping[str, float] | None = None,
     elastic: bool = False,
 ) -> Transcription:
     """The nonlinear program of a strike or throw; its parameters are the event's.
@@ -209,7 +210,8 @@ def transcribe(
     ``phases`` contain ``swing``, whose last knot is the event; ``pose`` are held angles (rad) and
     ``position`` boxes that differ from :data:`POSITION`; ``tool`` are balls around what is held,
     ``unloaded`` is the body in phases without it; ``feet``: how far the left foot stands to the
-    left of and ahead of the right one (m).
+    left of and ahead of the right one (m); ``comfort`` are angles (rad) in place of
+    :data:`COMFORT`.
     """
     model = reduce_tree(load_tree(body), free, pose or {})
     place = boxes({**POSITION, **(position or {})}, free)
@@ -268,7 +270,8 @@ def transcribe(
     loaded = np.array([k for k in everywhere if program.model_at(int(k)) is model])
     if tool:
         clearance.tool_off(program, body, tool, loaded)
-    wanted = {model.index(name): angle for name, angle in COMFORT.items() if name in model.names}
+    comfort = COMFORT if comfort is None else comfort
+    wanted = {model.index(name): angle for name, angle in comfort.items() if name in model.names}
     where, angles = list(wanted), ca.DM(list(wanted.values()))
     program.cost(
         "posture",
