@@ -124,8 +124,10 @@ def strike_clip(solution: Solution, certificate: Certificate, fps: float = 60.0)
 
 
 def name_of(solution: Solution) -> str:
-    """Of a demonstration's file: problem, side of a stroke, outcome, strength, style of a jump."""
-    problem, side = solution.problem, solution.stats.get("options", {}).get("side")
+    """Of a demonstration's file: problem, side of a stroke or kind of punch, outcome, strength,
+    style of a jump."""
+    problem, options = solution.problem, solution.stats.get("options", {})
+    side = options.get("side", options.get("punch"))
     rules = RULES.get(problem)
     asked = solution.asked[rules.outcome if rules else OUTCOMES[problem].field]
     unit = rules.unit.replace("/", "p") if rules else "m"

@@ -40,6 +40,10 @@ ADVICE: dict[str, str] = {
     "detail",
     "foremost contact": "the take-off is a foul: raise board",
     "touch-down": "the impact of the foot is not possible: raise detail, or start from a neighbour",
+    "replay in mujoco: lowest but feet": "the athlete falls in the replay: ask for less",
+    "replay in drake: lowest but feet": "the athlete falls in the replay: ask for less",
+    "replay in mujoco: opponent": "the weapon does not touch the opponent: raise detail",
+    "replay in drake: opponent": "the weapon does not touch the opponent: raise detail",
     "replay in": "played open loop the motion misses: raise detail, so that the torques between "
     "the knots are closer to those that are needed",
 }

@@ -7,12 +7,13 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from sports import table_tennis, tennis
+from sports import boxing, combat, fencing, table_tennis, tennis
 from sports.humanoid.body import Body
 from sports.humanoid.mjcf import build_model
 from sports.rackets import Game
 from sports.scene import Scene
-from warmstart import shot, tee_shot, thrown
+from warmstart import duel, shot, tee_shot, thrown
+from warmstart.outcome import link_poses
 from warmstart.solution import Solution
 from warmstart.strike import Moment, Rules
 
@@ -114,7 +115,65 @@ def _golf() -> Checks:
     return out
 
 
+def on_its_feet(solution: Solution, qpos: np.ndarray) -> dict[str, float]:
+    """Height (m) of the lowest link in any frame, feet and hands left out: tasks call it a fall
+    when one is below 0.15 m."""
+    pos, _ = link_poses(solution.body, qpos)
+    names = solution.body.link_names
+    counts = [not name.endswith(("Ankle", "Toe", "Wrist", "Hand")) for name in names]
+    return {"lowest but feet": float(pos[:, counts, 2].min())}
+
+
+def _stepped(solution: Solution, qpos: np.ndarray) -> dict[str, float]:
+    """How far (m) the front foot is ahead of where it stood, at the end, and the rear one of where
+    it stood, at any time."""
+    pos, _ = link_poses(solution.body, qpos)
+    feet = [pos[:, solution.body.link_index(f"{side}_Ankle"), :2] for side in "RL"]
+    front, rear = (np.linalg.norm(foot - foot[0], axis=1) for foot in feet)
+    return {"step": float(front[-1]), "rear foot moves": float(rear.max())}
+
+
+def _lunge(solution: Solution, found: Moment) -> dict[str, float]:
+    """How far over the ground the point is from where the root was at the start."""
+    return {
+        "outcome": float(np.linalg.norm(found.place[:2] - solution.qpos[0, :2])),
+        "tip speed": float(np.linalg.norm(found.velocity)),
+    }
+
+
+_REPLAYS = ("replay in mujoco: ", "replay in drake: ")
+_DUEL: Checks = {
+    f"{head}{name}": limit
+    for head in _REPLAYS
+    for name, limit in (
+        ("lowest but feet", (">=", 0.15, "m")),
+        ("opponent: force", (">=", combat.TOUCH_FORCE, "N")),
+        ("opponent: late", (*_RECORDED, "s")),
+    )
+}
+"""Whoever strikes stays on its feet, and the opponent of the task is touched."""
+
 RULES: dict[str, Rules] = {
+    "boxing": Rules(
+        "fist_speed",
+        "m/s",
+        nearest=True,
+        whole=on_its_feet,
+        play=lambda solution, engine: duel.met(solution, engine, boxing.GLOVES),
+        checks=_DUEL,
+    ),
+    "fencing": Rules(
+        "reach",
+        "m",
+        nearest=True,
+        follow=_lunge,
+        whole=lambda solution, qpos: on_its_feet(solution, qpos) | _stepped(solution, qpos),
+        play=lambda solution, engine: duel.met(solution, engine, fencing.SWORD),
+        checks=_DUEL
+        | {f"{head}tip speed": (*_RECORDED, "m/s") for head in ("planned ", *_REPLAYS)}
+        | {f"{head}step": (">=", 0.2, "m") for head in _REPLAYS}
+        | {f"{head}rear foot moves": ("<=", 0.1, "m") for head in _REPLAYS},
+    ),
     "golf": Rules(
         "club_speed",
         "m/s",

@@ -114,10 +114,12 @@ class Rules:
     """What comes of a moment beyond the hand, by name; ``outcome`` among it."""
     play: Callable[[Solution, str], dict[str, float]] | None = None
     """Figures of a replay in an engine with the real ball."""
+    whole: Callable[[Solution, np.ndarray], dict[str, float]] | None = None
+    """Figures of a whole replay, from its frames (T, 7 + n)."""
     also: Callable[[Solution], dict[str, float]] | None = None
     """Figures of the whole planned motion."""
     checks: Mapping[str, tuple[str, float, str]] = field(default_factory=dict)
-    """Checks of what ``follow`` and ``play`` find: sense, limit, unit."""
+    """Checks of what ``follow``, ``whole`` and ``play`` find: sense, limit, unit."""
 
 
 def limits(rules: Rules) -> dict[str, tuple[str, float, str]]:
@@ -175,6 +177,8 @@ def replayed(
         f"{head}late": found.time - event["time"],
         **_followed(rules, solution, found, head),
     }
+    if rules.whole is not None:
+        out |= {f"{head}{name}": value for name, value in rules.whole(solution, qpos).items()}
     if rules.play is not None:
         out |= {f"{head}{name}": value for name, value in rules.play(solution, engine).items()}
     return times, qpos, out

@@ -109,6 +109,22 @@ PROBLEMS: dict[str, Problem] = {
             sweep=(0.762, 0.838, 0.914, 0.991, 1.067),
             module="warmstart.problems.hurdling",
         ),
+        Problem(
+            name="boxing",
+            summary="jab or cross that meets the opponent's head or chest at a given fist speed",
+            outcome="fist_speed",
+            unit="m/s",
+            sweep=(5.0, 5.5, 6.0),
+            module="warmstart.problems.boxing",
+        ),
+        Problem(
+            name="fencing",
+            summary="lunge whose point touches the opponent's chest at a given reach",
+            outcome="reach",
+            unit="m",
+            sweep=(1.9, 2.0, 2.1),
+            module="warmstart.problems.fencing",
+        ),
     )
 }
 
