@@ -226,7 +226,7 @@ def render_sheet(
     buffer = io.BytesIO()
     if Path(path).suffix.lower() == ".jpg":
         half = (sheet.width // 2, sheet.height // 2)
-        sheet.resize(half, Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=80)
+        sheet.resize(half, Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=65, optimize=True)
     else:
         sheet.save(buffer, "PNG", optimize=True)
     return write_bytes(path, buffer.getvalue())
