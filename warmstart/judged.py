@@ -8,11 +8,12 @@ import mujoco
 import numpy as np
 
 from sports import table_tennis, tennis
+from sports.free_throw import RIM
 from sports.humanoid.body import Body
 from sports.humanoid.mjcf import build_model
 from sports.rackets import Game
 from sports.scene import Scene
-from warmstart import shot, tee_shot, thrown
+from warmstart import held_ball, shot, tee_shot, thrown
 from warmstart.solution import Solution
 from warmstart.strike import Moment, Rules
 
@@ -114,7 +115,52 @@ def _golf() -> Checks:
     return out
 
 
+def _free_throw(solution: Solution, found: Moment) -> dict[str, float]:
+    flight = thrown.fall(found.place, found.velocity, np.array(RIM))
+    return {
+        "outcome": flight["apex"],
+        "release speed": float(np.linalg.norm(found.velocity)),
+        "height": float(found.place[2]),
+        "miss of the ring's middle": flight["miss"],
+        "entry angle": flight["entry"],
+        "basket": flight["basket"],
+    }
+
+
+_FLIGHT = (
+    ("release speed", "m/s"),
+    ("height", "m"),
+    ("miss of the ring's middle", "m"),
+    ("entry angle", "deg"),
+    ("basket", "0 or 1"),
+)
+_BALL = (
+    ("ball: late", "s"),
+    ("ball: release speed", "m/s"),
+    ("ball: speed off", "of the asked speed"),
+    ("ball: direction off", "deg"),
+    ("ball: apex", "m"),
+    ("ball: miss of the ring's middle", "m"),
+    ("ball: basket", "0 or 1"),
+)
+
+
+def _throw_at_the_basket(play: Callable[[Solution, str], dict[str, float]] | None = None) -> Rules:
+    """Rules of a throw at the basket: planned, the ball goes in."""
+    replays = [f"replay in {engine}: " for engine in ("mujoco", "drake")]
+    checks: Checks = {
+        f"{head}{name}": (*_RECORDED, unit)
+        for head in ("planned ", *replays)
+        for name, unit in _FLIGHT
+    }
+    if play is not None:
+        checks |= {f"{head}{name}": (*_RECORDED, u) for head in replays for name, u in _BALL}
+    checks["planned basket"] = (">=", 1.0, "0 or 1")
+    return Rules("apex", "m", nearest=False, follow=_free_throw, play=play, checks=checks)
+
+
 RULES: dict[str, Rules] = {
+    "free_throw": _throw_at_the_basket(held_ball.figures),
     "golf": Rules(
         "club_speed",
         "m/s",
@@ -135,6 +181,7 @@ RULES: dict[str, Rules] = {
             for name in ("height", "distance")
         },
     ),
+    "set_shot": _throw_at_the_basket(),
     "table_tennis": _strokes(
         table_tennis.GAME,
         _table_tennis,
