@@ -28,14 +28,25 @@ class Starts:
     """(F,) labels of the frame's demonstration that the task understands (``bar_height``)."""
     probability: float = 0.5
     """Share of resets that start from a frame."""
+    object_qpos: Tensor | None = None
+    """(F, 7 k) of the k free objects of the scene in its order; NaN where a frame leaves them where
+    they are. None where no frame has any."""
+    object_qvel: Tensor | None = None
+    """(F, 6 k)"""
 
     def to(self, device: torch.device | str) -> Starts:
         """The same frames on a device."""
         context = {k: v.to(device) for k, v in self.context.items()}
-        return Starts(self.qpos.to(device), self.qvel.to(device), context, self.probability)
+        things = (x if x is None else x.to(device) for x in (self.object_qpos, self.object_qvel))
+        return Starts(
+            self.qpos.to(device), self.qvel.to(device), context, self.probability, *things
+        )
 
     def draw(self, state: PhysicsState, scene: Scene, generator: torch.Generator) -> Memory:
-        """Puts drawn frames into some rows of ``state``; labels (N,), NaN for the other rows."""
+        """Puts drawn frames into some rows of ``state``; labels (N,), NaN for the other rows.
+
+        Raises ValueError where the frames have another number of objects than the scene.
+        """
         device, frames = self.qpos.device, self.qpos.shape[0]
         draw = torch.rand(state.qpos.shape[0], 2, device=device, generator=generator)
         use = draw[:, 0] < self.probability
@@ -43,6 +54,18 @@ class Starts:
         q, v = scene.agent_qpos(0), scene.agent_qvel(0)
         state.qpos[:, q] = torch.where(use[:, None], self.qpos[frame], state.qpos[:, q])
         state.qvel[:, v] = torch.where(use[:, None], self.qvel[frame], state.qvel[:, v])
+        if self.object_qpos is not None and self.object_qvel is not None:
+            free = len(scene.free_objects)
+            if self.object_qpos.shape[1] != 7 * free:
+                raise ValueError(
+                    f"the frames have {self.object_qpos.shape[1] // 7} objects, scene "
+                    f"'{scene.name}' has {free}"
+                )
+            for whole, part in (
+                (state.qpos[:, -7 * free :], self.object_qpos[frame]),
+                (state.qvel[:, -6 * free :], self.object_qvel[frame]),
+            ):
+                whole[:] = torch.where(use[:, None] & ~part.isnan(), part, whole)
         nan = torch.full((), torch.nan, device=device)
         return {k: torch.where(use, c[frame], nan) for k, c in self.context.items()}
 

@@ -38,7 +38,8 @@ class Window:
     before: str | None = "landing"
     """Until an event of the clip's metadata: ``takeoff`` keeps the approach, ``landing`` the
     flight too; None, and a clip without the event, keep all. After the landing a demonstration
-    only falls: nothing to learn from, and for a task an outcome that somebody else earned."""
+    only falls: nothing to learn from, and for a task an outcome that somebody else earned. So is
+    the flight of what was thrown: unless None, a clip with objects ends at its ``release``."""
 
     def __post_init__(self) -> None:
         if self.start < 0 or (self.end is not None and self.end < self.start):
@@ -48,7 +49,8 @@ class Window:
         """Indices of the clip's frames inside the window."""
         end = clip.duration if self.end is None else self.end
         if self.before is not None:
-            end = min(end, float(clip.meta.get("events", {}).get(self.before, end)))
+            ends = [self.before, *(["release"] if clip.num_objects else [])]
+            end = min(end, *(float(clip.meta.get("events", {}).get(e, end)) for e in ends))
         inside = (clip.times >= self.start - 1e-9) & (clip.times <= end + 1e-9)
         return np.flatnonzero(inside)
 
@@ -85,20 +87,28 @@ class ClipBank:
         ``context`` names labels besides those of the clips' tasks; a clip without one has NaN
         there, which a task reads as "draw your own". Frames that reach more than ``floor`` (m)
         below the ground are left out; a loaded foot sinks up to 1 cm at a take-off. Raises
-        ValueError when no frame is left or a label is not a number.
+        ValueError when no frame is left, a label is not a number or the clips differ in objects.
         """
         window = window or Window()
         body = load_body(self.body)
         names = list(context)
         for clip in self.clips:
             names += [n for n in CONTEXT.get(clip.meta.get("problem", ""), ()) if n not in names]
-        qpos, qvel, labels = [], [], []
+        qpos, qvel, labels, things = [], [], [], []
+        counts = {clip.num_objects for clip in self.clips} - {0}
+        if len(counts) > 1:
+            raise ValueError(f"the clips of a bank must have the same objects, not {counts}")
+        count = max(counts, default=0)
         for clip in self.clips:
             rows = window.rows(clip)
             rows = rows[lowest(body, clip.qpos[rows]) >= -floor] if rows.size else rows
             qpos.append(clip.qpos[rows])
             qvel.append(clip.qvel[rows])
             labels.append(np.tile([label(clip, name) for name in names], (len(rows), 1)))
+            if clip.object_qpos is not None and clip.object_qvel is not None:
+                things.append(np.hstack([clip.object_qpos[rows], clip.object_qvel[rows]]))
+            else:
+                things.append(np.full((len(rows), 13 * count), np.nan))
         frames = np.concatenate(qpos)
         if not len(frames):
             raise ValueError(
@@ -108,12 +118,14 @@ class ClipBank:
         def tensor(rows: np.ndarray) -> torch.Tensor:
             return torch.tensor(rows, dtype=torch.float32)
 
-        values = np.concatenate(labels)
+        values, objects = np.concatenate(labels), np.concatenate(things)
         return Starts(
             qpos=tensor(frames),
             qvel=tensor(np.concatenate(qvel)),
             context={name: tensor(values[:, i]) for i, name in enumerate(names)},
             probability=probability,
+            object_qpos=tensor(objects[:, : 7 * count]) if count else None,
+            object_qvel=tensor(objects[:, 7 * count :]) if count else None,
         )
 
 

@@ -45,6 +45,8 @@ from warmstart.solution import Solution
 
 FINER = 5
 """Samples per interval of the optimiser."""
+FEET = ("Ankle", "Toe")
+"""Links whose contact points are on the ground."""
 LOADED = 0.01
 """A contact point counts as loaded from this share of body weight on."""
 
@@ -322,22 +324,25 @@ def _dynamics(solution: Solution, notes: dict[str, str]) -> dict[str, float]:
 
 
 def _contact(solution: Solution) -> dict[str, float]:
-    """Forces inside the friction cone, pushing only, at points that rest on the ground."""
+    """Forces inside the friction cone, pushing only, at the feet's points, which rest on the
+    ground; what hands do to each other is no contact with it."""
     motion = solution.sample(fine_times(solution))
     scene = humanoid_scene(solution.body)
     model = build_model(scene)
     data = mujoco.MjData(model)
     weight = solution.body.mass * GRAVITY
-    force = motion["contact_force"] / weight
+    feet = [c for c, (link, _) in enumerate(solution.contact_points) if link.endswith(FEET)]
+    force = motion["contact_force"][:, feet] / weight
     tangent = np.linalg.norm(force[:, :, :2], axis=2)
     loaded = np.linalg.norm(force, axis=2) > LOADED
-    links = [model.body(body_name(0, link)).id for link, _ in solution.contact_points]
+    points = [solution.contact_points[c] for c in feet]
+    links = [model.body(body_name(0, link)).id for link, _ in points]
     height, speed, jac = 0.0, 0.0, np.zeros((3, model.nv))
     for t in np.flatnonzero(loaded.any(1)):
         data.qpos[:], data.qvel[:] = motion["qpos"][t], motion["qvel"][t]
         mujoco.mj_forward(model, data)
         for c in np.flatnonzero(loaded[t]):
-            point = np.array(solution.contact_points[c][1])
+            point = np.array(points[c][1])
             where = data.xpos[links[c]] + data.xmat[links[c]].reshape(3, 3) @ point
             mujoco.mj_jac(model, data, jac, None, where, links[c])
             height = max(height, abs(float(where[2])))

@@ -1,7 +1,8 @@
 """The one motion format: an optimised jump, a recorded rollout and a mocap clip are all Clips.
 
 A file is an npz without pickle: ``qpos (T, 7 + n)``, ``qvel (T, 6 + n)``, optional ``ctrl (T, n)``
-(float32) and ``meta``, a JSON text. State convention (MuJoCo's): qpos = [p_WB (m), quaternion
+(float32), optional ``object_qpos (T, 7 k)`` and ``object_qvel (T, 6 k)`` of what the athlete
+handles, and ``meta``, a JSON text. State convention (MuJoCo's): qpos = [p_WB (m), quaternion
 w x y z, hinges in ``body.dofs`` order (rad)], qvel = [v_W (m/s), w_B in the root's frame (rad/s),
 hinge rates (rad/s)].
 """
@@ -50,6 +51,11 @@ class Clip:
     meta: dict[str, Any] = field(default_factory=dict)
     """Plain JSON. Used by the project: problem, asked, achieved, source, licence, strength,
     events (name -> seconds from the first frame)."""
+    object_qpos: np.ndarray | None = None
+    """(T, 7 k) place (m) and attitude (w x y z) of the k free objects of the task's scene, in its
+    order: a throw is no start without what is thrown. None for a motion of the athlete alone."""
+    object_qvel: np.ndarray | None = None
+    """(T, 6 k) their velocities: linear in the world (m/s), angular in their own frames (rad/s)."""
 
     def __post_init__(self) -> None:
         body = _table(self.body)
@@ -76,6 +82,7 @@ class Clip:
             raise ValueError(f"clip: a motion needs at least 2 frames, this one has {frames}")
         if len(self.qvel) != frames or (self.ctrl is not None and len(self.ctrl) != frames):
             raise ValueError("clip: qpos, qvel and ctrl differ in their number of frames")
+        self._check_objects()
         norm = np.linalg.norm(self.qpos[:, 3:7], axis=1)
         if np.abs(norm - 1.0).max() > 1e-2:
             frame = int(np.abs(norm - 1.0).argmax())
@@ -83,6 +90,34 @@ class Clip:
                 f"clip: the root quaternion of frame {frame} has length {norm[frame]:.3f}, not 1"
             )
         self.qpos[:, 3:7] /= norm[:, None]
+
+    def _check_objects(self) -> None:
+        if (self.object_qpos is None) != (self.object_qvel is None):
+            raise ValueError("clip: object_qpos and object_qvel come together")
+        if self.object_qpos is None or self.object_qvel is None:
+            return
+        qpos, qvel = (np.array(x, dtype=np.float64) for x in (self.object_qpos, self.object_qvel))
+        count = qpos.shape[-1] // 7 if qpos.ndim == 2 else 0
+        frames = len(self.qpos)
+        if count < 1 or qpos.shape != (frames, 7 * count) or qvel.shape != (frames, 6 * count):
+            raise ValueError(
+                f"clip: object_qpos {qpos.shape} and object_qvel {qvel.shape} are not 7 and 6 "
+                f"numbers of each object in {frames} frames"
+            )
+        if not (np.isfinite(qpos).all() and np.isfinite(qvel).all()):
+            raise ValueError("clip: an object's state is not finite")
+        quat = qpos.reshape(frames, count, 7)[..., 3:]
+        norm = np.linalg.norm(quat, axis=-1, keepdims=True)
+        if np.abs(norm - 1.0).max() > 1e-2:
+            raise ValueError("clip: an object's quaternion is not of length 1")
+        quat /= norm
+        object.__setattr__(self, "object_qpos", qpos)
+        object.__setattr__(self, "object_qvel", qvel)
+
+    @property
+    def num_objects(self) -> int:
+        """Free objects whose states the clip has."""
+        return 0 if self.object_qpos is None else self.object_qpos.shape[1] // 7
 
     @property
     def num_frames(self) -> int:
@@ -115,8 +150,9 @@ class Clip:
         """State at ``time`` (s), a number or (K,), inside the clip.
 
         Returns ``qpos`` (K, 7 + n), ``qvel`` (K, 6 + n) and, where the clip has it, ``ctrl``
-        (K, n) as it is held; without the axis K for a number. Cubic through the positions and
-        velocities of both neighbours; the attitude by the cubic rotation vector. Raises ValueError
+        (K, n) as it is held, ``object_qpos`` and ``object_qvel``; without the axis K for a number.
+        Cubic through the positions and velocities of both neighbours; the attitude by the cubic
+        rotation vector. Raises ValueError
         outside ``[0, duration]``.
         """
         t = np.atleast_1d(np.asarray(time, dtype=np.float64))
@@ -139,14 +175,21 @@ class Clip:
             if wraps:  # a hinge may jump by whole turns between frames without turning
                 step = step - 2 * np.pi * np.round((step - 0.5 * h * (v0 + v1)) / (2 * np.pi))
             qpos[:, p], qvel[:, v] = _cubic(q0, step, v0, v1, h, s)
-        base = self.qpos[k, 3:7]
-        phi1 = rotation.log(rotation.multiply(rotation.conjugate(base), self.qpos[k + 1, 3:7]))
-        w0 = self.qvel[k, 3:6]
-        w1 = np.linalg.solve(rotation.right_jacobian(phi1), self.qvel[k + 1, 3:6, None])[..., 0]
-        phi, rate = _cubic(np.zeros_like(phi1), phi1, w0, w1, h, s)
-        qpos[:, 3:7] = rotation.multiply(base, rotation.exp(phi))
-        qvel[:, 3:6] = (rotation.right_jacobian(phi) @ rate[..., None])[..., 0]
+        ends = [self.qpos[i, 3:7] for i in (k, k + 1)] + [self.qvel[i, 3:6] for i in (k, k + 1)]
+        qpos[:, 3:7], qvel[:, 3:6] = _turning(ends[0], ends[1], ends[2], ends[3], h, s)
         out = {"qpos": qpos, "qvel": qvel}
+        if self.object_qpos is not None and self.object_qvel is not None:
+            places, rates = np.empty((len(t), self.num_objects * 7)), []
+            for i in range(self.num_objects):
+                q, v = self.object_qpos[:, 7 * i :], self.object_qvel[:, 6 * i :]
+                places[:, 7 * i : 7 * i + 3], moving = _cubic(
+                    q[k, :3], q[k + 1, :3] - q[k, :3], v[k, :3], v[k + 1, :3], h, s
+                )
+                places[:, 7 * i + 3 : 7 * i + 7], turning = _turning(
+                    q[k, 3:7], q[k + 1, 3:7], v[k, 3:6], v[k + 1, 3:6], h, s
+                )
+                rates += [moving, turning]
+            out |= {"object_qpos": places, "object_qvel": np.concatenate(rates, axis=1)}
         if self.ctrl is not None:
             out["ctrl"] = self.ctrl[np.floor(x).astype(int)]
         return out if np.ndim(time) else {name: rows[0] for name, rows in out.items()}
@@ -172,7 +215,15 @@ class Clip:
         if "events" in meta:
             meta["events"] = {k: v - first / self.fps for k, v in meta["events"].items()}
         ctrl = None if self.ctrl is None else self.ctrl[rows]
-        return replace(self, qpos=self.qpos[rows], qvel=self.qvel[rows], ctrl=ctrl, meta=meta)
+        arrays = {name: x[rows] for name, x in self._objects().items()}
+        return replace(
+            self, qpos=self.qpos[rows], qvel=self.qvel[rows], ctrl=ctrl, meta=meta, **arrays
+        )
+
+    def _objects(self) -> dict[str, np.ndarray]:
+        """Copies of the objects' arrays, by name; empty without objects."""
+        names = ("object_qpos", "object_qvel") if self.num_objects else ()
+        return {name: getattr(self, name).copy() for name in names}
 
     def mirrored(self, y: float = 0.0) -> Clip:
         """Left and right exchanged: the motion seen in a mirror on the plane at ``y`` (m)."""
@@ -185,10 +236,16 @@ class Clip:
         qvel[:, :6] *= (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
         qpos[:, 7:], qvel[:, 6:] = qpos[:, 7:][:, dofs] * sign, qvel[:, 6:][:, dofs] * sign
         ctrl = None if self.ctrl is None else self.ctrl[:, dofs] * sign
+        objects = self._objects()
+        for i in range(self.num_objects):
+            place, rate = (x[:, w * i : w * (i + 1)] for x, w in zip(objects.values(), (7, 6)))
+            place[:, 1] = 2 * y - place[:, 1]
+            place[:, 3:7] *= (1.0, -1.0, 1.0, -1.0)
+            rate *= (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
         meta = {**self.meta, "mirrored": not self.meta.get("mirrored", False)}
         if not meta["mirrored"]:
             del meta["mirrored"]
-        return replace(self, qpos=qpos, qvel=qvel, ctrl=ctrl, meta=meta)
+        return replace(self, qpos=qpos, qvel=qvel, ctrl=ctrl, meta=meta, **objects)
 
     def moved(self, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> Clip:
         """The motion turned by ``yaw`` (rad) about the world's z axis, then shifted (m)."""
@@ -197,11 +254,17 @@ class Clip:
         qpos[:, :3] = rotation.rotate(turn, qpos[:, :3]) + np.array([x, y, 0.0])
         qpos[:, 3:7] = rotation.multiply(np.broadcast_to(turn, (len(qpos), 4)), qpos[:, 3:7])
         qvel[:, :3] = rotation.rotate(turn, qvel[:, :3])
-        return replace(self, qpos=qpos, qvel=qvel)
+        objects = self._objects()
+        for i in range(self.num_objects):
+            place, rate = (a[:, w * i : w * (i + 1)] for a, w in zip(objects.values(), (7, 6)))
+            place[:, :3] = rotation.rotate(turn, place[:, :3]) + np.array([x, y, 0.0])
+            place[:, 3:7] = rotation.multiply(np.broadcast_to(turn, (len(place), 4)), place[:, 3:7])
+            rate[:, :3] = rotation.rotate(turn, rate[:, :3])
+        return replace(self, qpos=qpos, qvel=qvel, **objects)
 
     def save(self, path: str | Path) -> None:
         """Writes an npz without pickle, atomically, numbers as float32."""
-        arrays = {"qpos": self.qpos, "qvel": self.qvel}
+        arrays = {"qpos": self.qpos, "qvel": self.qvel, **self._objects()}
         if self.ctrl is not None:
             arrays["ctrl"] = self.ctrl
         head = {"format": FORMAT, "fps": self.fps, "body": self.body, "meta": self.meta}
@@ -210,7 +273,7 @@ class Clip:
     @staticmethod
     def load(path: str | Path) -> Clip:
         """Reads what :meth:`save` wrote. Raises ValueError naming the file and what is wrong."""
-        arrays, head = read_npz(path, ("qpos", "qvel"), ("ctrl",))
+        arrays, head = read_npz(path, ("qpos", "qvel"), ("ctrl", "object_qpos", "object_qvel"))
         if head.get("format") != FORMAT:
             raise ValueError(
                 f"{path} is not a readable clip file: its format is "
@@ -291,6 +354,18 @@ def contact_events(solution: Solution) -> dict[str, float]:
     if index + 1 < len(solution.phases):
         events["landing"] = float(t[last])
     return events
+
+
+def _turning(
+    q0: np.ndarray, q1: np.ndarray, w0: np.ndarray, w1: np.ndarray, h: float, s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Attitude (K, 4) and angular velocity (K, 3) at the fraction s of a frame: the cubic rotation
+    vector through both ends."""
+    phi1 = rotation.log(rotation.multiply(rotation.conjugate(q0), q1))
+    end = np.linalg.solve(rotation.right_jacobian(phi1), w1[..., None])[..., 0]
+    phi, rate = _cubic(np.zeros_like(phi1), phi1, w0, end, h, s)
+    spin = (rotation.right_jacobian(phi) @ rate[..., None])[..., 0]
+    return rotation.multiply(q0, rotation.exp(phi)), spin
 
 
 def _cubic(

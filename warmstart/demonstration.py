@@ -19,6 +19,7 @@ from warmstart.certificate import Certificate, certify
 from warmstart.clip import Clip, clip_from_solution
 from warmstart.judged import RULES
 from warmstart.outcome import OUTCOMES, link_poses
+from warmstart.refine import Search, refine
 from warmstart.replay import REPLAY_RATE, replay_states
 from warmstart.solution import Solution
 from warmstart.tracking import Tracking, track_best
@@ -50,7 +51,8 @@ def demonstrate(
     progress: Callable[[int, int], None] | None = None,
 ) -> Demonstration:
     """Certifies a solution and tracks it in its task; a strike or throw, whose gate asks for a
-    replay that reaches the outcome, is that replay in MuJoCo.
+    replay that reaches the outcome, is that replay in MuJoCo; a free throw is thrown in its task
+    with the real ball (:mod:`warmstart.refine`).
 
     A ``certificate`` of the solution, where there is one already, is taken as it is. Raises
     ValueError when the solution's problem is no task.
@@ -58,6 +60,8 @@ def demonstrate(
     certificate = certificate or certify(solution)
     if not certificate.passed:
         return Demonstration(certificate, None, "; ".join(certificate.failures))
+    if solution.problem == "free_throw":
+        return _thrown(solution, certificate, attempts, threads, progress)
     if solution.problem in RULES:
         return Demonstration(certificate, strike_clip(solution, certificate), "")
     try:
@@ -78,6 +82,28 @@ def demonstrate(
     if not tracked.success:
         reason = f"tracked in MuJoCo, the task calls it no success: {clip.meta['achieved']}"
     return Demonstration(certificate, replace(clip, meta=meta), reason)
+
+
+def _thrown(
+    solution: Solution,
+    certificate: Certificate,
+    attempts: int,
+    threads: int,
+    progress: Callable[[int, int], None] | None,
+) -> Demonstration:
+    """A free throw that the task counts as a basket, sought with other seeds until it does."""
+    clip, reason = None, ""
+    for seed in range(attempts):
+        try:
+            clip = refine(solution, Search(seed=seed), threads=threads, progress=progress).clip
+        except RuntimeError as error:
+            reason = str(error)
+            continue
+        clip.meta.update(certified=True, planned=certificate.achieved.get("planned"))
+        if clip.meta["achieved"].get("success") == 1.0:
+            return Demonstration(certificate, clip, "")
+        reason = f"thrown in MuJoCo, the task calls it no success: {clip.meta['achieved']}"
+    return Demonstration(certificate, clip, reason)
 
 
 def strike_clip(solution: Solution, certificate: Certificate, fps: float = 60.0) -> Clip:

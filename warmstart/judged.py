@@ -8,11 +8,12 @@ import mujoco
 import numpy as np
 
 from sports import boxing, combat, fencing, table_tennis, tennis
+from sports.free_throw import RIM
 from sports.humanoid.body import Body
 from sports.humanoid.mjcf import build_model
 from sports.rackets import Game
 from sports.scene import Scene
-from warmstart import duel, shot, tee_shot, thrown
+from warmstart import duel, held_ball, shot, tee_shot, thrown
 from warmstart.outcome import link_poses
 from warmstart.solution import Solution
 from warmstart.strike import Moment, Rules
@@ -153,6 +154,50 @@ _DUEL: Checks = {
 }
 """Whoever strikes stays on its feet, and the opponent of the task is touched."""
 
+
+def _free_throw(solution: Solution, found: Moment) -> dict[str, float]:
+    flight = thrown.fall(found.place, found.velocity, np.array(RIM))
+    return {
+        "outcome": flight["apex"],
+        "release speed": float(np.linalg.norm(found.velocity)),
+        "height": float(found.place[2]),
+        "miss of the ring's middle": flight["miss"],
+        "entry angle": flight["entry"],
+        "basket": flight["basket"],
+    }
+
+
+_FLIGHT = (
+    ("release speed", "m/s"),
+    ("height", "m"),
+    ("miss of the ring's middle", "m"),
+    ("entry angle", "deg"),
+    ("basket", "0 or 1"),
+)
+_BALL = (
+    ("ball: late", "s"),
+    ("ball: release speed", "m/s"),
+    ("ball: speed off", "of the asked speed"),
+    ("ball: direction off", "deg"),
+    ("ball: apex", "m"),
+    ("ball: miss of the ring's middle", "m"),
+    ("ball: basket", "0 or 1"),
+)
+
+
+def _throw_at_the_basket(play: Callable[[Solution, str], dict[str, float]] | None = None) -> Rules:
+    """Rules of a throw at the basket: planned, the ball goes in."""
+    checks: Checks = {
+        f"{head}{name}": (*_RECORDED, unit)
+        for head in ("planned ", *_REPLAYS)
+        for name, unit in _FLIGHT
+    }
+    if play is not None:
+        checks |= {f"{head}{name}": (*_RECORDED, u) for head in _REPLAYS for name, u in _BALL}
+    checks["planned basket"] = (">=", 1.0, "0 or 1")
+    return Rules("apex", "m", nearest=False, follow=_free_throw, play=play, checks=checks)
+
+
 RULES: dict[str, Rules] = {
     "boxing": Rules(
         "fist_speed",
@@ -174,6 +219,7 @@ RULES: dict[str, Rules] = {
         | {f"{head}step": (">=", 0.2, "m") for head in _REPLAYS}
         | {f"{head}rear foot moves": ("<=", 0.1, "m") for head in _REPLAYS},
     ),
+    "free_throw": _throw_at_the_basket(held_ball.figures),
     "golf": Rules(
         "club_speed",
         "m/s",
@@ -194,6 +240,7 @@ RULES: dict[str, Rules] = {
             for name in ("height", "distance")
         },
     ),
+    "set_shot": _throw_at_the_basket(),
     "table_tennis": _strokes(
         table_tennis.GAME,
         _table_tennis,

@@ -40,6 +40,30 @@ class Phase:
 
 
 @dataclass(frozen=True)
+class Grip:
+    """Two hands that hold one thing between them.
+
+    It is rigid on the ``first`` link of the loaded athlete. While it is held neither hand moves
+    against the other, and the second one pushes it with a force that is free and whose reaction
+    the first one feels: the thing's own force is what the first hand adds to that. Forces act at
+    the thing's centre of mass; hands that turn it do so together.
+    """
+
+    first: str
+    point: tuple[float, float, float]
+    """The thing's centre of mass in the frame of the first link (m)."""
+    second: str
+    other: tuple[float, float, float]
+    """The same place in the frame of the second link (m)."""
+    turned: tuple[tuple[float, float, float], ...]
+    """(3, 3) R_first_second, which they keep."""
+    drift: float = 0.003
+    """How far the hands may be off that (m; rad over a lever of 0.1 m)."""
+    most: float = 100.0
+    """Largest component of the second hand's force (N)."""
+
+
+@dataclass(frozen=True)
 class Weights:
     """Cost weights. Effort is the integral of the squared torque over its limit."""
 
@@ -51,6 +75,10 @@ class Weights:
     shear: float = 0.0
     """On the integral of squared horizontal force at contact points over body weight. Feet that
     push against each other save effort, but the soft friction of engines creeps under load."""
+    press: float = 0.02
+    """On the integral of the squared force of the second hand of a grip over 20 N."""
+    press_rate: float = 1e-4
+    """On the integral of the squared rate of that (per s)."""
     acceleration: float = 2e-3
     """On the integral of squared joint acceleration over 50 rad/s^2."""
     acceleration_rate: float = 4e-4

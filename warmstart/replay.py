@@ -126,6 +126,10 @@ def scene_of(clip: Clip) -> Scene:
     return humanoid_scene(body_of(clip))
 
 
+def _first(rows: np.ndarray | None) -> torch.Tensor | None:
+    return None if rows is None else torch.tensor(rows[:1], dtype=torch.float32)
+
+
 def play(
     clip: Clip,
     task: str,
@@ -147,6 +151,8 @@ def play(
         qvel=torch.tensor(clip.qvel[:1], dtype=torch.float32),
         context={},
         probability=1.0,
+        object_qpos=_first(clip.object_qpos),
+        object_qvel=_first(clip.object_qvel),
     )
     env = make_env(
         task,
@@ -183,6 +189,8 @@ def play(
         qpos=np.array(qpos),
         qvel=np.array(qvel),
         ctrl=np.array(ctrl),
+        object_qpos=None,
+        object_qvel=None,
         meta=dict(clip.meta),
     )
     return out, {k: round(m, 6) for k, m in metrics.items() if np.isfinite(m)}

@@ -192,6 +192,8 @@ def track(
         qpos=qpos,
         qvel=qvel,
         ctrl=ctrl,
+        object_qpos=None,
+        object_qvel=None,
         meta={**clip.meta, "source": f"{clip.meta.get('source', 'clip')}, tracked in MuJoCo"},
     )
     if clip.meta.get("problem") in task_names():

@@ -23,7 +23,7 @@ from sports.humanoid.body import Body
 from sports.physics.base import GRAVITY
 from warmstart.contact import Ball, sole_points
 from warmstart.nlp import Program, Result
-from warmstart.phases import ELASTIC_PRICE, ELASTIC_REACH, MODES, Bounds, Phase, Weights
+from warmstart.phases import ELASTIC_PRICE, ELASTIC_REACH, MODES, Bounds, Grip, Phase, Weights
 from warmstart.rigid_body import ReducedModel, from_full_state, to_full_state
 from warmstart.solution import Solution
 
@@ -44,7 +44,9 @@ class Transcription:
         elastic: bool = False,
         standing: bool = False,
         unloaded: ReducedModel | None = None,
+        grip: Grip | None = None,
     ) -> None:
+        self.grip = grip
         self.standing = standing
         self.unloaded = unloaded or model
         self.body, self.model, self.phases = body, model, tuple(phases)
@@ -63,6 +65,7 @@ class Transcription:
         self._add_dynamics()
         self._add_intervals()
         self._add_contacts()
+        self._add_grip()
 
     # -- structure ---------------------------------------------------------------------------
     def knots(self, name: str) -> np.ndarray:
@@ -147,6 +150,11 @@ class Transcription:
                     self.f[side][k] = P.variable((6, 3), low, high, self.weight / 4)
             for k in self.toe_flat_knots(side):
                 self.fix(self.v[k, self.model.index(f"{side}_Toe_y")], 0.0)
+        if self.grip is not None:
+            most = self.grip.most
+            self.held = np.array([k for k in range(self.K) if self.model_at(k) is self.model])
+            self.press = np.zeros((self.K, 3), dtype=int)
+            self.press[self.held] = P.variable((len(self.held), 3), -most, most, 20.0)
 
     def _add_slack(self) -> None:
         """Torque limits may stretch, at a price: one factor per joint for the whole motion."""
@@ -213,11 +221,15 @@ class Transcription:
             limited = self.held_limits if points else self.flight_limits
             held = [tree.dofs.index(d) for d in limited if d not in model.free]
 
-            def build(q, v, a, u, *rest, points=points, held=held, model=model):
+            gripped = self.grip is not None and loaded
+
+            def build(q, v, a, u, *rest, points=points, held=held, model=model, gripped=gripped):
                 forces, rows = [], []
+                if gripped:  # the last of the rest are the parameters
+                    forces = self._grip_forces(rest[-2])
                 if points:
                     f = ca.reshape(rest[0], 3, len(points))
-                    forces = [(tree.link(link), p, f[:, i]) for i, (link, p) in enumerate(points)]
+                    forces += [(tree.link(link), p, f[:, i]) for i, (link, p) in enumerate(points)]
                     fx, fy, fz = (f[i, :].T / self.weight for i in range(3))
                     mx, my = self.bounds.friction_x, self.bounds.friction_y
                     cone = ca.vertcat(fx - mx * fz, -fx - mx * fz, fy - my * fz, -fy - my * fz)
@@ -240,7 +252,54 @@ class Transcription:
                 inputs.append(
                     np.array([np.hstack([self.f[s][k].ravel() for s in sides]) for k in knots])
                 )
+            if gripped:
+                inputs.append(self.press[ks])
             self.program.block(f"dynamics {'+'.join(sides) or 'flight'}", inputs, build)
+
+    def _grip_forces(self, press) -> list[tuple[int, tuple[float, float, float], object]]:
+        """On both hands, of the force (3x1, N) with which the second one pushes what is held."""
+        assert self.grip is not None
+        first, second = (self.model.tree.link(b) for b in (self.grip.first, self.grip.second))
+        return [(first, self.grip.point, press), (second, self.grip.other, -press)]
+
+    def _add_grip(self) -> None:
+        """Neither hand moves against the other while they hold something, nor drifts by what the
+        velocities at the knots leave over; the force of the second one costs a little, so that it
+        is unique."""
+        if self.grip is None:
+            return
+        model, grip, w = self.model, self.grip, self.weights
+        first, second = (model.tree.link(b) for b in (grip.first, grip.second))
+
+        def still(q, v, p):
+            motion = model.motion(q, v)
+            apart = motion.point_velocity(second, grip.other)
+            apart -= motion.point_velocity(first, grip.point)
+            turn = motion.R_WL[second] @ motion.w[second] - motion.R_WL[first] @ motion.w[first]
+            return 0.0, [("hands together", apart / 0.5, 0.0, 0.0), ("turn", turn / 5, 0.0, 0.0)]
+
+        def place(q, p):
+            motion = model.motion(q)
+            apart = motion.point(second, grip.other) - motion.point(first, grip.point)
+            turn = motion.R_WL[first].T @ motion.R_WL[second] @ ca.DM(grip.turned).T
+            skew = ca.vertcat(turn[2, 1], turn[0, 2], turn[1, 0]) - ca.vertcat(
+                turn[1, 2], turn[2, 0], turn[0, 1]
+            )
+            limit = np.repeat([grip.drift, grip.drift / 0.1], 3)
+            return [("hands drift", ca.vertcat(apart, skew / 2), -limit, limit)]
+
+        self.program.block("grip", [self.q[self.held], self.v[self.held]], still)
+        self.rows("grip drift", self.held[1:], place)
+        pairs = np.array([k for k in self.held if k + 1 in self.held])
+        h = self.h[self.interval_phase()][pairs][:, None]
+
+        def rate(f0, f1, h, p):
+            size = 20.0
+            level = w.press * h * p[-1] * ca.sumsqr(f0 / size)
+            return level + w.press_rate * ca.sumsqr((f1 - f0) / size) / (h * p[-1]), []
+
+        inputs = [self.press[pairs], self.press[pairs + 1], h]
+        self.program.block("press", inputs, rate, self.spacing()[pairs][:, None])
 
     def _add_intervals(self) -> None:
         """Integration defects and the running cost."""
@@ -440,6 +499,8 @@ class Transcription:
                 if point in points:
                     for k, index in self.f[side].items():
                         x[index[i]] = s["contact_force"][k, points[point]]
+        if self.grip is not None:
+            x[self.press[self.held]] = -s["contact_force"][self.held, -1]
         self._guess_rest(x)
         strike = solution.stats.get("touch_down")
         if self.before is not None and strike:
@@ -466,26 +527,44 @@ class Transcription:
         q, v, a = (ca.SX.sym(name, model.n) for name in "qva")
         f = ca.SX.sym("f", 3, len(points))
         forces = [(model.tree.link(link), p, f[:, i]) for i, (link, p) in enumerate(points)]
+        press = ca.SX.sym("press", 3)
+        grips = self._grip_forces(press) if self.grip is not None else []
         functions = [
-            ca.Function("tau", [q, v, a, f], [m.inverse_dynamics(q, v, a, forces)])
-            for m in (self.model, self.unloaded)
+            ca.Function("tau", [q, v, a, f, press], [m.inverse_dynamics(q, v, a, every)])
+            for m, every in ((self.model, forces + grips), (self.unloaded, forces))
         ]
         force = self.forces(x)
         torque = np.zeros((self.K, model.tree.num_dofs))
         for k in range(self.K):
             tau = functions[self.model_at(k) is not self.model]
-            out = np.array(tau(x[self.q[k]], x[self.v[k]], x[self.a[k]], force[k].T)).ravel()
+            push = force[k, : len(points)].T
+            state = x[self.q[k]], x[self.v[k]], x[self.a[k]]
+            out = np.array(tau(*state, push, -force[k, -1])).ravel()
             torque[k] = out[6:]
         torque[:, model.free_index] += model.tree.damping[model.free_index] * x[self.v[:, 6:]]
         return torque
 
     def forces(self, x: np.ndarray) -> np.ndarray:
-        """(K, C, 3) contact forces (N, world), sides in order, six points each."""
-        out = np.zeros((self.K, 6 * len(self.sides), 3))
+        """(K, C, 3) contact forces (N, world): sides in order, six points each, then what both
+        hands of a grip feel."""
+        feet = 6 * len(self.sides)
+        out = np.zeros((self.K, feet + (2 if self.grip is not None else 0), 3))
         for i, side in enumerate(self.sides):
             for k, index in self.f[side].items():
                 out[k, 6 * i : 6 * i + 6] = x[index]
+        if self.grip is not None:
+            out[self.held, feet], out[self.held, feet + 1] = (
+                sign * x[self.press[self.held]] for sign in (1.0, -1.0)
+            )
         return out
+
+    def contact_points(self) -> tuple[tuple[str, tuple[float, float, float]], ...]:
+        """The C points (link, place in its frame (m)) of :meth:`forces`."""
+        grip = self.grip
+        feet = tuple(p for s in self.sides for p in sole_points(self.body, s))
+        if grip is None:
+            return feet
+        return (*feet, (grip.first, grip.point), (grip.second, grip.other))
 
     def _touch_down_stats(self, x: np.ndarray) -> dict[str, object]:
         """The rates before the touch-down (qvel) and the impulse at the sole points (N s)."""
@@ -516,6 +595,8 @@ class Transcription:
                 if side in phase.feet
                 for point in MODES[phase.feet[side]]
             ]
+            if self.grip is not None and phase.loaded:
+                active += [6 * len(self.sides), 6 * len(self.sides) + 1]
             phases.append((phase.name, int(self.ends[i]), int(self.ends[i + 1]), tuple(active)))
         return Solution(
             problem=problem,
@@ -527,7 +608,7 @@ class Transcription:
             qvel=qvel,
             qacc=qacc,
             torque=self.full_torque(x),
-            contact_points=tuple(p for s in self.sides for p in sole_points(self.body, s)),
+            contact_points=self.contact_points(),
             contact_force=self.forces(x),
             phases=tuple(phases),
             stats={

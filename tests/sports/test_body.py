@@ -257,7 +257,16 @@ def test_the_point_of_the_sword_is_a_shape_of_its_own():
 
 
 def test_equipment_list_is_complete():
-    assert set(equipment_names()) == {"club", "racket", "paddle", "sword", "gloves", "javelin"}
+    assert set(equipment_names()) == {
+        "club",
+        "racket",
+        "paddle",
+        "sword",
+        "gloves",
+        "javelin",
+        "basketball",
+        "basketball_two_hands",
+    }
 
 
 # ---- shapes --------------------------------------------------------------------------------

@@ -102,6 +102,22 @@ PROBLEMS: dict[str, Problem] = {
             module="warmstart.problems.golf",
         ),
         Problem(
+            name="free_throw",
+            summary="throw with both hands from the free-throw line on a path into the basket",
+            outcome="apex",
+            unit="m",
+            sweep=(0.7, 0.9, 1.2),
+            module="warmstart.problems.free_throw",
+        ),
+        Problem(
+            name="set_shot",
+            summary="shot at the basket with one hand, by the athlete without fingers",
+            outcome="apex",
+            unit="m",
+            sweep=(0.7, 0.9, 1.2),
+            module="warmstart.problems.set_shot",
+        ),
+        Problem(
             name="hurdling",
             summary="one stride over a hurdle of given height at a given run speed",
             outcome="hurdle_height",

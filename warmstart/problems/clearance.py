@@ -33,7 +33,8 @@ def _end(body: Body, link: str) -> Ball:
 
 
 def _forearm(body: Body, side: str) -> list[Ball]:
-    return [*axis_balls(body, f"{side}_Elbow", 3), _end(body, f"{side}_Hand")]
+    hand = f"{side}_Hand" if f"{side}_Hand" in body.link_names else f"{side}_Wrist"
+    return [*axis_balls(body, f"{side}_Elbow", 3), _end(body, hand)]
 
 
 def obstacles(body: Body) -> list[Ball]:

@@ -24,7 +24,7 @@ from warmstart import rotation
 from warmstart.contact import Ball
 from warmstart.nlp import Result
 from warmstart.outcome import link_poses
-from warmstart.phases import Bounds, Phase, Weights
+from warmstart.phases import Bounds, Grip, Phase, Weights
 from warmstart.problems import clearance, jumper
 from warmstart.rigid_body import load_tree, reduce_tree
 from warmstart.solution import Solution
@@ -140,6 +140,8 @@ class Event:
     normal: tuple[float, float, float]
     fixed: tuple[int, ...] = (0, 1, 2)
     """Coordinates of ``place`` that are prescribed; the others are the optimiser's."""
+    facing: bool = True
+    """Whether the axis must; else the optimiser decides where it points."""
     spin: float = np.inf
     """Largest component of the link's angular velocity (rad/s)."""
     straight: float = np.inf
@@ -199,10 +201,12 @@ def transcribe(
     held_limits: Sequence[str] = HELD_LIMITS,
     tool: Sequence[Ball] = (),
     unloaded: Body | None = None,
-    feet: tuple[tuple[float, float], tuple[float, float]] = ((0.4, 0.75), (-0.3, 0.3)),
+    feet: tuple[tuple[float, float], tuple[float, float]] | None = ((0.4, 0.75), (-0.3, 0.3)),
     bounds: Mapping[str, float] | None = None,
     shear: float = SHEAR,
     comfort: Mapping[str, float] | None = None,
+    grip: Grip | None = None,
+    aim: Callable[[Any], Any] | None = None,
     elastic: bool = False,
 ) -> Transcription:
     """The nonlinear program of a strike or throw; its parameters are the event's.
@@ -210,8 +214,9 @@ def transcribe(
     ``phases`` contain ``swing``, whose last knot is the event; ``pose`` are held angles (rad) and
     ``position`` boxes that differ from :data:`POSITION`; ``tool`` are balls around what is held,
     ``unloaded`` is the body in phases without it; ``feet``: how far the left foot stands to the
-    left of and ahead of the right one (m); ``comfort`` are angles (rad) in place of
-    :data:`COMFORT`.
+    left of and ahead of the right one (m), None where the problem says itself how it stands;
+    ``comfort`` are angles (rad) in place of :data:`COMFORT`; ``grip``: two hands at one thing;
+    ``aim`` gives the velocity of the event by its place (3x1), where that is not prescribed.
     """
     model = reduce_tree(load_tree(body), free, pose or {})
     place = boxes({**POSITION, **(position or {})}, free)
@@ -233,6 +238,7 @@ def transcribe(
         elastic=elastic,
         standing=True,
         unloaded=reduce_tree(load_tree(unloaded), free, pose or {}) if unloaded else None,
+        grip=grip,
     )
     at = int(program.knots("swing")[-1])
     link = model.tree.link(event.link)
@@ -240,12 +246,17 @@ def transcribe(
     def strike(q, v, p):
         motion = model.motion(q, v)
         axis = motion.R_WL[link] @ ca.DM(list(event.axis))
-        off = motion.point(link, event.point) - p[:3]
+        here = motion.point(link, event.point)
+        velocity = p[3:6] if aim is None else aim(here)
         rows = [] if event.spin == np.inf else [("spin", motion.w[link], -event.spin, event.spin)]
+        if event.fixed:
+            rows.append(("place", (here - p[:3])[list(event.fixed)] / 0.1, 0.0, 0.0))
+        off = motion.point_velocity(link, event.point) - velocity
+        rows.append(("velocity", off / 5.0, 0.0, 0.0))
+        if not event.facing:
+            return rows
         return [
             *rows,
-            ("place", off[list(event.fixed)] / 0.1, 0.0, 0.0),
-            ("velocity", (motion.point_velocity(link, event.point) - p[3:6]) / 5.0, 0.0, 0.0),
             ("direction", ca.vertcat(ca.dot(axis, p[9:12]), ca.dot(axis, p[12:15])), 0.0, 0.0),
             ("facing", ca.dot(axis, p[6:9]), 0.5, np.inf),
         ]
@@ -265,7 +276,8 @@ def transcribe(
         program.program.block("event pull", here, pull)
     rest(program)
     everywhere = np.arange(program.K)
-    stance(program, body, *feet)
+    if feet is not None:
+        stance(program, body, *feet)
     clearance.arms_off(program, body, everywhere)
     loaded = np.array([k for k in everywhere if program.model_at(int(k)) is model])
     if tool:
@@ -338,12 +350,14 @@ def solve(
     what: str,
     where: tuple[float, float, float] = (0.0, 0.0, 0.0),
     thrown: tuple[str, float] | None = None,
+    finish: Callable[[Solution, dict[str, Any]], dict[str, Any]] | None = None,
     **stats: object,
 ) -> Solution:
     """The least-effort motion with an event, put at ``where`` (x, y, yaw) of its sport.
 
     ``transcribed(elastic)`` makes the program, ``guessed`` a first guess of it; ``guess`` is a
-    neighbour's solution; ``thrown`` names what leaves the hand, and in which time (s). Raises
+    neighbour's solution; ``thrown`` names what leaves the hand, and in which time (s); ``finish``
+    tells what the optimiser decided about the event, whose place is known. Raises
     Infeasible, saying ``what`` was asked for.
     """
 
@@ -367,15 +381,26 @@ def solve(
     if free:  # where the optimiser put it
         here = place_of(solution, at)
         at["place"] = [float(here[i]) if i in free else at["place"][i] for i in range(3)]
+    if finish is not None:
+        at |= finish(solution, at)
     return replace(solution, stats=solution.stats | {"event": at})
 
 
 def place_of(solution: Solution, event: dict[str, Any]) -> np.ndarray:
     """(3,) where the event's point is at its time (m)."""
-    qpos = solution.sample(np.array([event["time"]]))["qpos"]
-    pos, quat = link_poses(solution.body, qpos)
+    pos, quat = _link_of(solution, event)
+    return pos + rotation.rotate(quat, np.array(event["point"]))
+
+
+def axis_of(solution: Solution, event: dict[str, Any]) -> np.ndarray:
+    """(3,) where the event's axis points at its time (unit)."""
+    return rotation.rotate(_link_of(solution, event)[1], np.array(event["axis"]))
+
+
+def _link_of(solution: Solution, event: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    pos, quat = link_poses(solution.body, solution.sample(np.array([event["time"]]))["qpos"])
     link = solution.body.link_index(event["link"])
-    return pos[0, link] + rotation.rotate(quat[0, link], np.array(event["point"]))
+    return pos[0, link], quat[0, link]
 
 
 def unplaced(solution: Solution) -> Solution:

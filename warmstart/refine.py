@@ -1,0 +1,253 @@
+"""A planned free throw made one that a policy could throw: with the real ball, in the task.
+
+Played open loop the plan lets go a little late, because real contacts are soft, and a policy's
+targets are held over control steps of 1/30 s. A few numbers change the plan's targets: when it
+starts, how far it leads, how hard it drives, when the fingers open, and bumps on the targets of
+both arms around the release. They are sought by the cross-entropy method (Rubinstein 1999) on
+batches of MuJoCo worlds, until the task's own rules call the throw a basket. Every frame of the
+clip that comes out is a state which MuJoCo reached from the task's own start.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from sports.env import make_env, make_scene
+from sports.free_throw import LOWEST, RIM
+from sports.hoop import RING_RADIUS
+from sports.physics.base import GRAVITY
+from warmstart import thrown
+from warmstart.clip import Clip
+from warmstart.held_ball import fingers
+from warmstart.solution import Solution
+from warmstart.tracking import _Worlds
+
+TASK = "free_throw"
+BUMPED = ("Shoulder_x", "Shoulder_y", "Shoulder_z", "Elbow_z", "Wrist_x", "Wrist_z")
+"""Joints of the arms with bumps on their targets; left and right mirror each other..."""
+MIRROR = {"x": -1.0, "y": 1.0, "z": -1.0}
+"""... so that the left angle is this times the right one."""
+BUMPS = (-0.2, -0.1, 0.0)
+"""Middles of the bumps, from the release (s); each is as wide as they are apart."""
+WIDTH = 0.1
+UNITS = np.array([0.02, 0.02, 0.3, 0.03, *[0.12] * (len(BUMPS) * len(BUMPED)), 0.1])
+"""Of the parameters: start (s), lead (s), drive (of the torque), opening of the fingers (s), bumps
+(rad), and how far both shoulders turn to one side (rad)."""
+LATENCY = 0.02
+"""How much later than the plan the targets start (s), besides the parameter."""
+RETURN = 0.7
+"""Time in which the targets go back to those of standing, after the plan (s)."""
+WATCHED = 0.14
+"""How long after the release a candidate is judged by its flight (s)."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """Settings of the search."""
+
+    worlds: int = 24
+    """Candidates of a round."""
+    rounds: int = 20
+    near: float = 0.10
+    """A ball that comes down within this of the ring's middle (m) is tried in the task."""
+    level: float = 0.15
+    """A basket whose apex is within this of the asked one (m) ends the search."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What the search found."""
+
+    clip: Clip
+    """The throw as the task played it, from its own start, with the ball; ``meta["achieved"]`` has
+    the task's metrics."""
+    rounds: int
+
+    @property
+    def success(self) -> bool:
+        """Whether the task counts a basket."""
+        return self.clip.meta["achieved"].get("success") == 1.0
+
+
+class _Thrower:
+    """Candidates in MuJoCo, from the task's start."""
+
+    def __init__(self, solution: Solution, worlds: int, threads: int) -> None:
+        self.solution, self.scene = solution, make_scene(TASK, strength=solution.body.strength)
+        self.worlds = _Worlds(self.scene, worlds, threads)
+        self.release = float(solution.stats["event"]["time"])
+        self.steps = math.ceil((self.release + WATCHED) / self.scene.control_timestep)
+        body = self.scene.body
+        self.bent, self.hold = fingers(body), self.scene.action_offset()
+        self.kp, self.limit = body.array("kp"), body.action_scale()
+
+    def targets(self, numbers: np.ndarray, steps: int) -> np.ndarray:
+        """(steps, n) PD targets (rad) of the parameters (P,), in their units."""
+        body, parts = self.scene.body, self.scene.substeps
+        start, lead, drive, opening, *rest = numbers * UNITS
+        bumps, aside = np.array(rest[:-1]).reshape(len(BUMPS), len(BUMPED)), rest[-1]
+        middle = (np.arange(steps)[:, None] + (np.arange(parts) + 0.5) / parts).ravel()
+        t = middle * self.scene.control_timestep - LATENCY + start
+        motion = self.solution.sample(np.clip(t + lead, 0.0, self.solution.duration))
+        out = motion["qpos"][:, 7:] + (1.0 + drive) * motion["torque"] / self.kp
+        held = t < self.release + opening
+        out[:, self.bent] = np.where(held[:, None], self.hold[self.bent], 0.0)
+        for when, sizes in zip(BUMPS, bumps):
+            shape = np.maximum(0.0, 1.0 - np.abs(t - self.release - when) / WIDTH)
+            for joint, size in zip(BUMPED, sizes):
+                out[:, body.dof_index(f"R_{joint}")] += size * shape
+                out[:, body.dof_index(f"L_{joint}")] += MIRROR[joint[-1]] * size * shape
+        turned = np.clip((t - self.release + 0.25) / 0.1, 0.0, 1.0) * (t < self.release + 0.03)
+        for side in "LR":
+            out[:, body.dof_index(f"{side}_Shoulder_z")] += aside * turned
+        out = out.reshape(steps, parts, -1).mean(1)
+        return np.clip(out, self.hold - self.limit, self.hold + self.limit)
+
+    def judge(self, numbers: np.ndarray) -> np.ndarray:
+        """(N,) cost of candidates (N, P): where the ball would come down and how high it goes, a
+        ball that sinks too low or is not free, and the size of the changes."""
+        count, scene, worlds = len(numbers), self.scene, self.worlds
+        ctrl = np.stack([self.targets(row, self.steps) for row in numbers])
+        worlds.put(count, scene.default_qpos(), np.zeros(scene.nv), np.zeros(scene.nv))
+        ball, rate = scene.object_qpos("ball"), scene.object_qvel("ball")
+        lowest, before, step = np.full(count, np.inf), np.zeros((count, 3)), scene.control_timestep
+        for k in range(self.steps):
+            before = worlds.qvel[:count, rate][:, :3].copy()
+            worlds.step(ctrl[:, k])
+            if k * step < self.release:
+                lowest = np.minimum(lowest, worlds.qpos[:count, ball][:, 2])
+        place, velocity = worlds.qpos[:count, ball][:, :3], worlds.qvel[:count, rate][:, :3]
+        push = np.linalg.norm((velocity - before) / step + (0.0, 0.0, GRAVITY), axis=1)
+        cost = 0.01 * (numbers**2).sum(1) + 5.0 * np.maximum(LOWEST + 0.02 - lowest, 0.0)
+        cost += 0.2 * np.maximum(push - 1.0, 0.0)
+        asked = self.solution.asked["apex"]
+        self.miss = np.zeros(count)
+        for i in range(count):
+            flight = thrown.fall(place[i], velocity[i], np.array(RIM))
+            self.miss[i] = flight["miss"] if flight["apex"] > RING_RADIUS else np.inf
+            cost[i] += flight["miss"] + 0.5 * abs(flight["apex"] - asked)
+            cost[i] += 2.0 * (flight["apex"] < RING_RADIUS)
+        return np.nan_to_num(cost, nan=1e6, posinf=1e6)
+
+
+def refine(
+    solution: Solution,
+    settings: Search | None = None,
+    *,
+    threads: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Refined:
+    """Seeks a throw with the real ball that the task calls a basket, from a planned one.
+
+    ``progress(round, rounds)`` is called after every round. The best throw is returned whether
+    the task calls it a basket or not. Raises RuntimeError when the simulation diverges.
+    """
+    settings = settings or Search()
+    thrower = _Thrower(solution, settings.worlds, threads)
+    rng = np.random.default_rng(settings.seed)
+    mean, spread = np.zeros(len(UNITS)), np.full(len(UNITS), 0.5)
+    best, least, miss, tried = mean, np.inf, np.inf, None
+    elites = max(4, settings.worlds // 6)
+    weight = np.log(elites + 0.5) - np.log(np.arange(1, elites + 1))
+    weight /= weight.sum()
+    found: Refined | None = None
+    done = 0
+    for done in range(1, settings.rounds + 1):
+        drawn = mean + spread * rng.standard_normal((settings.worlds, len(UNITS)))
+        drawn[0], drawn[1] = best, mean
+        cost = thrower.judge(drawn)
+        order = np.argsort(cost, kind="stable")[:elites]
+        if cost[order[0]] < least:
+            best, least, miss = drawn[order[0]].copy(), cost[order[0]], thrower.miss[order[0]]
+        middle = weight @ drawn[order]
+        width = np.sqrt(weight @ (drawn[order] - middle) ** 2)
+        mean, spread = 0.2 * mean + 0.8 * middle, 0.3 * spread + 0.7 * width + 0.02
+        if progress is not None:
+            progress(done, settings.rounds)
+        if miss <= settings.near and best is not tried:
+            tried = best
+            now = Refined(perform(solution, thrower, best), done)
+            if found is None or _rank(now) > _rank(found):
+                found = now
+            if found.success and _off(found) <= settings.level:
+                return found
+    return found or Refined(perform(solution, thrower, best), done)
+
+
+def _off(found: Refined) -> float:
+    """How far the apex is off the asked one (m)."""
+    meta = found.clip.meta
+    return abs(meta["achieved"].get("apex", math.inf) - meta["asked"]["apex"])
+
+
+def _rank(found: Refined) -> tuple[bool, float]:
+    return found.success, -_off(found)
+
+
+def perform(solution: Solution, thrower: _Thrower, numbers: np.ndarray) -> Clip:
+    """The throw of the parameters (P,), played in the task with the ball until it ends."""
+    strength = solution.body.strength
+    env = make_env(TASK, num_worlds=1, strength=strength, training=False)
+    env.keep_snapshot = True
+    scene, body = env.physics.scene, env.physics.scene.body
+    rate = 1.0 / scene.control_timestep
+    ctrl = thrower.targets(numbers, math.ceil(solution.duration * rate))
+    offset, scale = scene.action_offset(), body.action_scale()
+    first = env.snapshot()
+    qpos, qvel = [first["qpos"][0]], [first["qvel"][0]]
+    played, metrics, release = [], {}, None
+    for step in range(env.max_steps):
+        back = min(max(step - len(ctrl) + 1, 0) / (RETURN * rate), 1.0)
+        target = ctrl[min(step, len(ctrl) - 1)]
+        target = target + back * (offset - target)
+        action = torch.tensor((target - offset) / scale, dtype=torch.float32)
+        result = env.step(action[None, None])
+        if not bool(result.valid[0]):
+            raise RuntimeError(f"the throw diverged at control step {step}")
+        played.append(target)
+        metrics = {name: float(value[0]) for name, value in result.metrics.items()}
+        qpos.append(env.final_snapshot["qpos"][0].clone())
+        qvel.append(env.final_snapshot["qvel"][0].clone())
+        if release is None and math.isfinite(metrics["release_speed"]):
+            release = step - 2  # thrown after two free steps: this frame is still in the hands
+        if bool(result.terminated[0] | result.truncated[0]):
+            break
+    env.close()
+    played.append(played[-1])
+    places, rates = torch.stack(qpos).double().numpy(), torch.stack(qvel).double().numpy()
+    q, v = scene.agent_qpos(0), scene.agent_qvel(0)
+    ball, moving = scene.object_qpos("ball"), scene.object_qvel("ball")
+    achieved = {name: value for name, value in metrics.items() if math.isfinite(value)}
+    events = {}
+    if release is not None:
+        events["release"] = max(release, 0) / rate
+        free = max(release, 0) + 2
+        flight = thrown.fall(places[free, ball][:3], rates[free, moving][:3], np.array(RIM))
+        achieved["apex"] = flight["apex"]
+    meta: dict[str, Any] = {
+        "problem": TASK,
+        "asked": dict(solution.asked),
+        "achieved": {name: round(value, 6) for name, value in achieved.items()},
+        "strength": strength,
+        "options": solution.stats.get("options", {}),
+        "source": "trajectory optimisation, thrown in MuJoCo with the real ball",
+        "licence": "Apache-2.0",
+        "events": events,
+    }
+    return Clip(
+        fps=rate,
+        body=body.name,
+        qpos=places[:, q],
+        qvel=rates[:, v],
+        ctrl=np.array(played),
+        meta=meta,
+        object_qpos=places[:, ball],
+        object_qvel=rates[:, moving],
+    )
