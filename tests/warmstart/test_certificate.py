@@ -211,7 +211,7 @@ def spoiled() -> dict[str, tuple[Solution, str]]:
         "under the ground": (thrown(qpos=low), "depth below the ground"),
         "through the bar": (thrown(asked={"bar_height": 1.6}), "clearance over the bar"),
         "nothing asked": (thrown(asked={}), "clearance over the bar"),
-        "unknown problem": (thrown(problem="golf"), "problem is known"),
+        "unknown problem": (thrown(problem="croquet"), "problem is known"),
     }  # fmt: skip
 
 
@@ -258,7 +258,7 @@ def test_file_round_trip_and_a_file_that_lies(good, tmp_path):
     assert not rewritten(lambda c: c["checks"][2].update(value=None, passed=True)).passed
     assert not rewritten(loosened).passed
     assert not rewritten(lambda c: c.update(checks=[], passed=True)).passed
-    assert not rewritten(lambda c: c.update(problem="golf")).passed
+    assert not rewritten(lambda c: c.update(problem="croquet")).passed
     path.write_text('{"checks": 3}')
     with pytest.raises(ValueError, match=r"certificate\.json is not a readable certificate"):
         Certificate.from_json(path)
