@@ -20,7 +20,13 @@ def catalogue() -> dict[str, list[dict[str, Any]]]:
 
 
 def run_list(config: List) -> int:
-    """Prints the catalogue as tables or as JSON."""
+    """Prints the catalogue as tables or as JSON, or writes the pages of the demonstrations."""
+    if config.previews is not None:
+        from olympics_opt.previews import write_previews
+
+        for path in write_previews(config.previews):
+            print(f"wrote {path}")
+        return 0
     found = catalogue()
     if config.json:
         print(json.dumps(found, indent=2))
@@ -37,7 +43,7 @@ def run_list(config: List) -> int:
         for name in rows[0]:
             table.add_column(name, overflow="fold")
         for row in rows:
-            table.add_row(*(_cell(value) for value in row.values()))
+            table.add_row(*(_cell(value) for value in _short(row).values()))
         console.print(table)
         console.print()
     return 0
@@ -103,6 +109,14 @@ def _demonstrations() -> list[dict[str, Any]]:
     from warmstart.bank import list_demonstrations
 
     return list_demonstrations()
+
+
+def _short(row: dict[str, Any]) -> dict[str, Any]:
+    """A row for a table: of what a demonstration achieved, what was asked for and its success."""
+    asked, achieved = row.get("asked"), row.get("achieved")
+    if not isinstance(asked, dict) or not isinstance(achieved, dict):
+        return row
+    return row | {"achieved": {k: v for k, v in achieved.items() if k in asked or k == "success"}}
 
 
 def _cell(value: Any) -> str:

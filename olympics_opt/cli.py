@@ -36,6 +36,8 @@ class List:
 
     json: bool = False
     """Print JSON instead of tables."""
+    previews: Path | None = None
+    """Folder for a page of every demonstration: 3-D replay, checks, curves."""
 
 
 @dataclass(frozen=True)

@@ -86,8 +86,10 @@ class ReplayTrack:
 
     @classmethod
     def from_clip(cls, clip: Any, name: str) -> ReplayTrack:
-        """A track of a motion clip (`warmstart.clip.Clip`)."""
-        return cls(name, clip.qpos, 1.0 / clip.fps)
+        """A track of a motion clip (`warmstart.clip.Clip`), with what the athlete handles."""
+        things = getattr(clip, "object_qpos", None)  # the scene's last coordinates
+        qpos = clip.qpos if things is None else np.hstack((clip.qpos, things))
+        return cls(name, qpos, 1.0 / clip.fps)
 
 
 def aligned(tracks: Iterable[ReplayTrack], x: float = 20.0) -> list[ReplayTrack]:
