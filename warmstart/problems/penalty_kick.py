@@ -4,8 +4,8 @@ The athlete stands at rest with the left foot beside the ball and the right one 
 right foot slowly off the ground, swings it back and kicks; the left foot stays where it stands. The
 front of the toes meets the ball: a ball without friction leaves along the face that hits it, so the
 face points where the ball shall go and the foot moves along it. The speed of the foot follows from
-that of the ball by Newton's restitution with the foot's effective mass (:mod:`warmstart.kick`). The plan
-does not know the blow of the ball, which comes after the event and is felt in the replays.
+that of the ball by Newton's restitution with the foot's effective mass (:mod:`warmstart.kick`). The
+plan does not know the blow of the ball, which comes after the event and is felt in the replays.
 """
 
 from __future__ import annotations
