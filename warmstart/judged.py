@@ -7,13 +7,13 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from sports import boxing, combat, fencing, table_tennis, tennis
+from sports import boxing, combat, fencing, penalty_kick, table_tennis, tennis
 from sports.free_throw import RIM
 from sports.humanoid.body import Body
 from sports.humanoid.mjcf import build_model
 from sports.rackets import Game
 from sports.scene import Scene
-from warmstart import duel, held_ball, shot, tee_shot, thrown
+from warmstart import duel, held_ball, kick, shot, tee_shot, thrown
 from warmstart.outcome import link_poses
 from warmstart.solution import Solution
 from warmstart.strike import Moment, Rules
@@ -67,13 +67,16 @@ def _strokes(
     )
 
 
-def depth_in(solution: Solution, scene: Scene, name: str, rate: float = 240.0) -> float:
-    """How deep (m) the planned athlete reaches into an object of a scene at most, by MuJoCo."""
+def depth_in(
+    solution: Solution, scene: Scene, name: str, rate: float = 240.0, until: float = np.inf
+) -> float:
+    """How deep (m) the planned athlete reaches into an object of a scene at most before a time (s
+    from the first knot), by MuJoCo."""
     model = build_model(scene)
     data = mujoco.MjData(model)
     body = model.body(name).id
     data.qpos[:] = scene.default_qpos()
-    times = np.arange(0.0, solution.duration, 1.0 / rate)
+    times = np.arange(0.0, min(solution.duration, until), 1.0 / rate)
     deepest = 0.0
     for row in solution.sample(solution.times[0] + times)["qpos"]:
         data.qpos[scene.agent_qpos(0)] = row
@@ -198,6 +201,39 @@ def _throw_at_the_basket(play: Callable[[Solution, str], dict[str, float]] | Non
     return Rules("apex", "m", nearest=False, follow=_free_throw, play=play, checks=checks)
 
 
+def _before_the_ball(solution: Solution) -> dict[str, float]:
+    world = penalty_kick.scene(penalty_kick.PenaltyKick(), solution.body)
+    until = float(solution.stats["event"]["time"])
+    depth = depth_in(solution, world, "ball", rate=960.0, until=until)
+    return {"planned depth in the ball before the impact": depth}
+
+
+def _penalty_kick() -> Rules:
+    checks: Checks = {
+        "planned depth in the ball before the impact": ("<=", 0.002, "m"),
+        "planned off target": ("<=", 0.25, "m"),
+        "planned effective mass": (*_RECORDED, "kg"),
+    }
+    for engine in ("mujoco", "drake"):
+        checks |= {
+            f"replay in {engine}: {name}": (*_RECORDED, unit)
+            for name, unit in (
+                ("off target", "m"),
+                ("ball: speed", "m/s"),
+                ("ball: off target", "m"),
+            )
+        }
+    return Rules(
+        "ball_speed",
+        "m/s",
+        nearest=True,
+        follow=kick.followed,
+        play=kick.played,
+        also=_before_the_ball,
+        checks=checks,
+    )
+
+
 RULES: dict[str, Rules] = {
     "boxing": Rules(
         "fist_speed",
@@ -241,6 +277,7 @@ RULES: dict[str, Rules] = {
         },
     ),
     "set_shot": _throw_at_the_basket(),
+    "penalty_kick": _penalty_kick(),
     "table_tennis": _strokes(
         table_tennis.GAME,
         _table_tennis,

@@ -141,6 +141,14 @@ PROBLEMS: dict[str, Problem] = {
             sweep=(1.9, 2.0, 2.1),
             module="warmstart.problems.fencing",
         ),
+        Problem(
+            name="penalty_kick",
+            summary="kick of the ball from a stand to a target in the goal",
+            outcome="ball_speed",
+            unit="m/s",
+            sweep=(15.0, 16.0, 17.0),
+            module="warmstart.problems.penalty_kick",
+        ),
     )
 }
 

@@ -198,6 +198,7 @@ def transcribe(
     free: Sequence[str] = FREE,
     pose: Mapping[str, float] | None = None,
     position: Mapping[str, tuple[float, float]] | None = None,
+    rate: Mapping[str, tuple[float, float]] | None = None,
     held_limits: Sequence[str] = HELD_LIMITS,
     tool: Sequence[Ball] = (),
     unloaded: Body | None = None,
@@ -211,12 +212,13 @@ def transcribe(
 ) -> Transcription:
     """The nonlinear program of a strike or throw; its parameters are the event's.
 
-    ``phases`` contain ``swing``, whose last knot is the event; ``pose`` are held angles (rad) and
-    ``position`` boxes that differ from :data:`POSITION`; ``tool`` are balls around what is held,
-    ``unloaded`` is the body in phases without it; ``feet``: how far the left foot stands to the
-    left of and ahead of the right one (m), None where the problem says itself how it stands;
-    ``comfort`` are angles (rad) in place of :data:`COMFORT`; ``grip``: two hands at one thing;
-    ``aim`` gives the velocity of the event by its place (3x1), where that is not prescribed.
+    ``phases`` contain ``swing``, whose last knot is the event; ``pose`` are held angles (rad),
+    ``position`` and ``rate`` boxes that differ from :data:`POSITION` and :data:`RATE`; ``tool`` are
+    balls around what is held, ``unloaded`` is the body in phases without it; ``feet``: how far the
+    left foot stands to the left of and ahead of the right one (m), None where the problem says
+    itself how it stands; ``comfort`` are angles (rad) in place of :data:`COMFORT`; ``grip``: two
+    hands at one thing; ``aim`` gives the velocity of the event by its place (3x1), where that is
+    not prescribed.
     """
     model = reduce_tree(load_tree(body), free, pose or {})
     place = boxes({**POSITION, **(position or {})}, free)
@@ -229,7 +231,7 @@ def transcribe(
         phases,
         Bounds(
             place,
-            boxes(RATE, free),
+            boxes({**RATE, **(rate or {})}, free),
             **{"hinge_rate": 35.0, "acceleration": 1000.0, "torque_share": SHARE, **(bounds or {})},
         ),
         Weights(shear=shear),
