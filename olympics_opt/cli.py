@@ -236,6 +236,34 @@ class Study:
 
 
 @dataclass(frozen=True)
+class Tracker:
+    """How well a motion tracker follows clips, by split, archive and sport.
+
+    Train one with ``olympics-opt train tracking --clips LIBRARY --out RUN``.
+    """
+
+    policy: str
+    """A run folder or a policy file of the task ``tracking``; ``zero`` plays the clips' own poses
+    as PD targets."""
+    clips: tuple[Path, ...]
+    """A library that ``mocap pack`` wrote, or clips (.npz) and folders of them."""
+    out: Path
+    """JSON file for the result."""
+    split: Literal["all", "train", "held_out"] = "all"
+    """Which of the clips: those that training sees, the tenth that it never sees, or all."""
+    engine: Literal["mujoco", "warp", "drake"] = "mujoco"
+    """Physics engine; ``warp`` needs a GPU."""
+    worlds: int | None = None
+    """Worlds simulated at a time; by default as many as suit the engine."""
+    seed: int = 0
+    """Seed of the policy ``random``."""
+    strength: Literal["paper", "human"] | None = None
+    """Strength of the athlete; by default the one the policy was trained with."""
+    limits: Literal["paper", "anatomical"] | None = None
+    """Joint ranges; by default those the policy was trained with."""
+
+
+@dataclass(frozen=True)
 class Leaderboard:
     """Rebuild results/README.md and the results of README.md from results/*.json."""
 
@@ -276,6 +304,7 @@ COMMANDS: dict[str, Command] = {
     "mocap": Command(
         None, "olympics_opt.mocap:main", summary="Make clips of recorded motions of people."
     ),
+    "tracker": Command(Tracker, "olympics_opt.tracker:run_tracker"),
     "bench": Command(
         None, "olympics_opt.bench:main", summary="Measure physics, environment and training speed."
     ),

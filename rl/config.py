@@ -20,6 +20,8 @@ from sports.registry import get_task, task_names
 
 DEFAULT_WORLDS = {"mujoco": 256, "warp": 8192, "drake": 4}
 DEFAULT_SAMPLES = 100_000_000
+TRACKING = "tracking"
+"""The task of the motion tracker. It is not in the registry: it is nothing without clips."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,8 @@ class TrainConfig:
     init: str | None = None
     """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]."""
     clips: tuple[Path, ...] = ()
-    """Demonstrations (npz) from whose frames episodes may start."""
+    """Demonstrations (npz) from whose frames episodes may start; for the task ``tracking`` the
+    motions to follow: a packed library, or clips and folders of them."""
     start_probability: tuple[float, float] = (0.5, 0.1)
     """Share of episodes that start from a demonstration, at the beginning and end of the run."""
     imitation: float = 0.0
@@ -127,6 +130,20 @@ def default_env(config: TrainConfig, seed: int) -> Env:
     physics_options = dict(config.physics_options)
     if config.vary:
         physics_options |= {"variation": Variation(), "variation_seed": seed}
+    if config.task == TRACKING:
+        from rl.tracker import TrackingConfig, make_tracking_env
+
+        return make_tracking_env(
+            config.clips,
+            engine=config.engine,
+            num_worlds=config.num_worlds,
+            seed=seed,
+            strength=config.strength,
+            limits=config.limits,
+            config=TrackingConfig(**config.options),
+            physics_options=physics_options,
+            timestep_divisor=config.timestep_divisor,
+        )
     return make_env(
         config.task,
         engine=config.engine,
@@ -139,6 +156,15 @@ def default_env(config: TrainConfig, seed: int) -> Env:
         physics_options=physics_options,
         timestep_divisor=config.timestep_divisor,
     )
+
+
+def task_options(task: str) -> type:
+    """The options' dataclass of a task. Raises ValueError for an unknown one."""
+    if task == TRACKING:
+        from rl.tracker import TrackingConfig
+
+        return TrackingConfig
+    return get_task(task).config
 
 
 def load_starts(paths: tuple[Path, ...], probability: float) -> Starts:
@@ -193,7 +219,8 @@ def _same_options(task: str, given: dict[str, Any], own: dict[str, Any]) -> None
     The command line gives every option of the task, asked for or not, so that one at its default
     asks for nothing; lists are what JSON made of the run's tuples.
     """
-    plain = dataclasses.asdict(get_task(task).config()) if task in task_names() else {}
+    known = (*task_names(), TRACKING)
+    plain = dataclasses.asdict(task_options(task)()) if task in known else {}
     for name, value in given.items():
         asked = json.loads(json.dumps(value))
         default = json.loads(json.dumps(plain.get(name)))
@@ -226,10 +253,11 @@ def parse_args(args: list[str], prog: str = "python -m rl.train") -> TrainConfig
     """
     if not args or args[0].startswith("-"):
         if not {"-h", "--help"} & set(args):
-            raise ValueError(f"say which task to train: {', '.join(task_names())}")
-        print(f"usage: {prog} TASK [options], TASK one of {', '.join(task_names())}\n")
+            raise ValueError(f"say which task to train: {', '.join((*task_names(), TRACKING))}")
+        known = ", ".join((*task_names(), TRACKING))
+        print(f"usage: {prog} TASK [options], TASK one of {known}\n")
         tyro.cli(TrainConfig, args=args, prog=f"{prog} TASK")
-    name, options_type = args[0], get_task(args[0]).config
+    name, options_type = args[0], task_options(args[0])
 
     def command(run: TrainConfig, task: Any) -> TrainConfig:
         given = {f.name: getattr(task, f.name) for f in dataclasses.fields(task)}

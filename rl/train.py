@@ -25,6 +25,7 @@ from rl import provenance
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
 from rl.config import (
     DEFAULT_SAMPLES,
+    TRACKING,
     MakeEnv,
     TrainConfig,
     default_env,
@@ -119,7 +120,7 @@ class _Trainer:
             config = replace(config, ppo=replace(config.ppo, **shape))
         self.config, self.hyper = config, config.hyper
         self.env = environment(config, config.seed + 7919 * self.rank)
-        if starts is None and config.clips:
+        if starts is None and config.clips and config.task != TRACKING:
             starts = load_starts(config.clips, config.start_probability[0])
         if starts is not None:
             self.env.starts = starts.to(self.env.device)
@@ -297,6 +298,9 @@ class _Trainer:
         if h.sigma_final is not None:
             self.agent.sigma.fill_(h.sigma * (h.sigma_final / h.sigma) ** share)
         self.agent.actor_weight.fill_(0.0 if self.iteration < self.warmup else 1.0)
+        schedule = getattr(self.env, "schedule", None)
+        if schedule is not None:  # an environment with a curriculum over the whole run
+            schedule(share)
         if self.env.starts is not None:
             first, last = c.start_probability
             self.env.starts.probability = first + (last - first) * share
@@ -346,6 +350,7 @@ class _Trainer:
             "commit": provenance.commit(),
             "versions": provenance.versions(),
             "metrics": dict(self.metrics),
+            **getattr(self.env, "card", {}),
         }
 
     def _save(self) -> Path:

@@ -152,12 +152,16 @@ class Env:
             return self._step(action)
 
     def targets(self, action: Tensor) -> Tensor:
-        """(..., act) PD targets (rad) of actions (..., act), which are clipped to [-1, 1]."""
+        """(..., act) PD targets (rad) of actions (..., act), which are clipped to [-1, 1]; of a
+        task with its own, actions (N, A, act) of the present state."""
         limited = action.to(torch.float32).clamp(-1.0, 1.0)
+        if self.task.targets is not None:
+            return self.task.targets(self.view, self.memory, limited)
         return torch.addcmul(self.action_offset, limited, self.action_scale)
 
     def _step(self, action: Tensor) -> StepResult:
-        self.physics.step(self.targets(action).flatten(1))
+        self.view.ctrl = self.targets(action)
+        self.physics.step(self.view.ctrl.flatten(1))
         self.view.clock = self.view.clock + 1
         self.age = self.age + 1
         self.view.refresh()
@@ -169,7 +173,10 @@ class Env:
         terms = {k: v.masked_fill(lost, 0.0) for k, v in step.terms.items()}
         reward = reduce(torch.add, terms.values())
         terminated = step.terminated & valid[:, None]
-        over = (terminated.any(-1) | (self.age >= self.max_steps)) & valid
+        over = terminated.any(-1) | (self.age >= self.max_steps)
+        if step.truncated is not None:
+            over = over | step.truncated
+        over = over & valid
         truncated = over[:, None] & ~terminated
         ended = over | bad
         if step.move is not None:

@@ -39,6 +39,8 @@ class View:
     """(B,) heights (m) below which a link's origin means a fall; -inf for ankles, toes, tools."""
     heaviest: Tensor
     """(B,) squared forces of the ground (N^2) above which a link has fallen; inf for those."""
+    ctrl: Tensor | None = None
+    """(N, A, act) PD targets (rad) of the last step; None before the first."""
     _heading: Heading | None = None
     _pressure: Tensor | None = None
 
@@ -126,6 +128,8 @@ class Advance:
     """(N,) bool, meaningful where terminated: promotes the curriculum."""
     remaining_paid: Tensor | None = None
     """(N,) bool: pay this step's reward for the steps left (outcome decided early)."""
+    truncated: Tensor | None = None
+    """(N,) bool: the world begins anew without an outcome: bootstrap, as at the time limit."""
     move: Move | None = None
     """Done after the step, before it is observed; not where the world begins anew."""
 
@@ -167,6 +171,9 @@ class Task:
     """(config, num_worlds, device) -> curriculum state, (N,) tensors."""
     promote: Callable[[View, Memory, Advance, Tensor], Memory] | None = None
     """(view, memory, advance, ended (N,)) -> new curriculum state."""
+    targets: Callable[[View, Memory, Tensor], Tensor] | None = None
+    """(view, memory, action (N, A, act) in [-1, 1]) -> PD targets (N, A, act), rad, where they are
+    not the body's scale times the action around the scene's offset."""
     age_at_start: bool = True
     """Whether training starts episodes' truncation clocks at random ages."""
     shown: tuple[str, ...] = ("target", "phases")
