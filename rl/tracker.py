@@ -53,7 +53,7 @@ class TrackingConfig:
     """Shares of those four in the reward."""
     power: float = 2e-5
     """Cost of a watt of the servos, either sign. PHC's 5e-4 is too much here: demonstrations
-    played without a policy take 2.3 kW, all that tracking can pay, and falling would be worth it."""
+    played without a policy take 2.3 kW, so that falling would be worth it."""
     action_rate: float = 0.02
     """Cost of the mean squared change of the action from step to step."""
     curriculum_share: float = 0.7
