@@ -236,8 +236,8 @@ class Tracking:
         servo = self._kp * (ctrl - view.physics.qpos[:, 7:])
         torque = torch.minimum(torch.maximum(servo, -self._effort), self._effort)
         power = (torque * view.physics.qvel[:, 6:]).abs().sum(-1)
-        names = ("position", "rotation", "velocity", "spin")
-        terms = dict(zip(names, scores.unbind(-1)))
+        names = ["position", "rotation", "velocity", "spin"]
+        terms: dict[str, Tensor] = dict(zip(names, scores.unbind(-1)))
         terms["power"] = -c.power * power
         changed = (memory["steps"] > 0) * (action - memory["action"]).square().mean(-1)
         terms["action_rate"] = -c.action_rate * changed

@@ -160,8 +160,9 @@ class Env:
         return torch.addcmul(self.action_offset, limited, self.action_scale)
 
     def _step(self, action: Tensor) -> StepResult:
-        self.view.ctrl = self.targets(action)
-        self.physics.step(self.view.ctrl.flatten(1))
+        ctrl = self.targets(action)
+        self.physics.step(ctrl.flatten(1))
+        self.view.ctrl = ctrl
         self.view.clock = self.view.clock + 1
         self.age = self.age + 1
         self.view.refresh()

@@ -290,6 +290,22 @@ class Clip:
             raise ValueError(f"{path}: {error}") from error
 
 
+def clip_files(source: str | Path) -> list[tuple[Path, str]]:
+    """Clip files of a source, a file or a folder, each with its name inside the source.
+
+    Raises ValueError where there is nothing, or no npz.
+    """
+    source = Path(source)
+    if not source.exists():
+        raise ValueError(f"there is nothing at {source}")
+    if source.is_file():
+        return [(source, source.name)]
+    files = [p for p in sorted(source.rglob("*.npz")) if p.is_file() and not p.name.startswith(".")]
+    if not files:
+        raise ValueError(f"{source} holds no clip (.npz)")
+    return [(p, p.relative_to(source).as_posix()) for p in files]
+
+
 def finite_difference_qvel(body: Body, qpos: np.ndarray, fps: float) -> np.ndarray:
     """(T, 6 + n) velocities in MuJoCo's convention of frames ``qpos`` (T, 7 + n), T >= 2.
 

@@ -16,8 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sports.humanoid.body import load_body
-from warmstart.clip import Clip
-from warmstart.mocap.tracked import clip_files
+from warmstart.clip import Clip, clip_files
 from warmstart.npz import read_npz, write_npz
 
 FORMAT = "olympics-opt clip library 1"

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from warmstart.clip import Clip
+from warmstart.clip import Clip, clip_files
 from warmstart.correction import LIGHT, Bounds, correct
 from warmstart.mocap.record import read_record, write_record
 from warmstart.tracking import Tracking
@@ -53,22 +53,6 @@ class Entry:
     """The tracked clip's path inside the folder, where one was written."""
     measured: dict[str, Any] = field(default_factory=dict)
     compute_seconds: float = 0.0
-
-
-def clip_files(source: str | Path) -> list[tuple[Path, str]]:
-    """Clip files of a source, a file or a folder, each with its name inside the source.
-
-    Raises ValueError where there is nothing, or no npz.
-    """
-    source = Path(source)
-    if not source.exists():
-        raise ValueError(f"there is nothing at {source}")
-    if source.is_file():
-        return [(source, source.name)]
-    files = [p for p in sorted(source.rglob("*.npz")) if p.is_file() and not p.name.startswith(".")]
-    if not files:
-        raise ValueError(f"{source} holds no clip (.npz)")
-    return [(p, p.relative_to(source).as_posix()) for p in files]
 
 
 def track_clips(
