@@ -22,6 +22,13 @@ from warmstart import rotation
 from warmstart.clip import Clip
 from warmstart.library import FPS, Library
 
+DOWN = 0.015
+"""A link whose lowest point is below this (m) and slower than ``REST`` is on the ground ..."""
+REST = 0.3
+"""m/s"""
+OFF = 0.05
+"""... and one above this height (m) is not; in between nobody can say."""
+
 
 class Reference(NamedTuple):
     """Where links are in some frames (N); world frame, m, m/s, rad/s."""
@@ -107,7 +114,7 @@ class MotionTables:
             plain.append(_rows(link_motion(body, path, FPS), geometry))
             seen.append(_rows(link_motion(body, mirrored, FPS), geometry))
         self._rows = torch.cat(plain + seen).to(self.device)
-        """(2 F, W) float32, the fields of ``_widths`` side by side."""
+        """(2 F, W) float32, the fields of ``_at`` side by side."""
         lengths = library.lengths
         counts = lengths + 1
         first = np.cumsum(counts) - counts
@@ -122,7 +129,7 @@ class MotionTables:
         self.lengths = torch.tensor(lengths, device=self.device)
         """(C,) frames of each clip."""
         b, n = self.num_links, self.num_dofs
-        widths = [3 * b, 4 * b, 3 * b, 3 * b, 7, 6, n, n, 1]
+        widths = [3 * b, 4 * b, 3 * b, 3 * b, 7, 6, n, n, 1, b]
         ends = np.cumsum(widths)
         self._at = [slice(int(e - w), int(e)) for e, w in zip(ends, widths)]
 
@@ -141,13 +148,18 @@ class MotionTables:
         """(N, n) hinge angles (rad) in frames (N,), within half a turn."""
         return self._rows[:, self._at[6]].index_select(0, frame)
 
+    def contact(self, frame: Tensor) -> Tensor:
+        """(N, B) in frames (N,): 1 for links on the ground, -1 for links off it, 0 where the
+        motion leaves it open."""
+        return self._rows[:, self._at[9]].index_select(0, frame)
+
     def state(self, frame: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 7 + n) qpos and (N, 6 + n) qvel to start from in frames (N,).
 
         The athlete is lifted by as much as it reaches below the ground.
         """
         rows = self._rows.index_select(0, frame)
-        root, spin, joints, rates, lift = (rows[:, s] for s in self._at[4:])
+        root, spin, joints, rates, lift = (rows[:, s] for s in self._at[4:9])
         up = torch.nn.functional.pad(lift, (2, 4))
         return torch.cat((root + up, joints), 1), torch.cat((spin, rates), 1)
 
@@ -159,7 +171,10 @@ def _rows(motion: LinkMotion, geometry: Geometry) -> Tensor:
     wrapped = angles - 2 * np.pi * np.round(angles / (2 * np.pi))
     pos, quat = (torch.tensor(x, dtype=torch.float32) for x in (motion.pos, motion.quat))
     down = torch.tensor([0.0, 0.0, -1.0])
-    deepest = geometry.extent(pos, quat, down).amax(-1, keepdim=True)  # -height of the lowest
+    height = -geometry.extent(pos, quat, down)  # (T, B) of the lowest point
+    slow = torch.tensor(np.linalg.norm(motion.linvel, axis=-1)) < REST
+    contact = ((height < DOWN) & slow).float() - (height > OFF).float()
+    lift = (-height.amin(-1, keepdim=True)).clamp(min=0.0)
     parts = [
         motion.pos,
         motion.quat,
@@ -171,4 +186,4 @@ def _rows(motion: LinkMotion, geometry: Geometry) -> Tensor:
         motion.qvel[:, 6:],
     ]
     flat = [torch.tensor(p.reshape(frames, -1), dtype=torch.float32) for p in parts]
-    return torch.cat([*flat, deepest.clamp(min=0.0)], dim=1)
+    return torch.cat([*flat, lift, contact], dim=1)

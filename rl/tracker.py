@@ -30,6 +30,8 @@ from warmstart.library import FPS, Library, load_library
 NAME = "tracking"
 LOST = 0.5
 """A mean distance of the links (m) beyond which a clip counts as not followed (PHC)."""
+ROOT_SHARPNESS = 100.0
+"""1/m^2, of the cost of the root's height."""
 HORIZON = 300
 """Control steps of a training episode; a new one begins elsewhere."""
 
@@ -56,6 +58,11 @@ class TrackingConfig:
     strength ``paper`` an explored high jump takes 7 kW, so that falling would be worth it."""
     action_rate: float = 0.02
     """Cost of the mean squared change of the action from step to step."""
+    root_height: float = 0.05
+    """Cost of a root far off the reference's height: times 1 - exp(-100/m^2 squared error)."""
+    contact: float = 0.02
+    """Cost of each link that touches the ground where the reference's is clearly off it, or does
+    not where it clearly stands."""
     curriculum_share: float = 0.7
     """Part of the run over which tolerance and sharpness change."""
     uniform: float = 0.2
@@ -67,7 +74,8 @@ class TrackingConfig:
 
     def __post_init__(self) -> None:
         numbers = (*self.tolerance, *self.sharpness, *self.sharpness_final, self.residual)
-        if min(numbers) <= 0.0 or min(*self.weights, self.power, self.action_rate) < 0.0:
+        costs = (self.power, self.action_rate, self.root_height, self.contact)
+        if min(numbers) <= 0.0 or min(*self.weights, *costs) < 0.0:
             raise ValueError("tolerances, exponents and residual must be positive, weights not < 0")
         if not 0.0 < self.curriculum_share <= 1.0 or not 0.2 <= self.uniform <= 1.0:
             raise ValueError("curriculum_share must lie in (0, 1], uniform in [0.2, 1]")
@@ -117,6 +125,13 @@ def tracking_errors(body: Reference, reference: Reference) -> Tensor:
         (body.angvel - reference.angvel).square().sum(-1),
     )
     return torch.stack([x.mean(-1) for x in squares], -1)
+
+
+def contact_mismatch(touching: Tensor, reference: Tensor) -> Tensor:
+    """(N,) links whose contact with the ground differs: ``touching`` (N, B) bool against 1 (on the
+    ground), -1 (off it) and 0 (either way) of ``reference`` (N, B)."""
+    touches = touching.float()
+    return torch.where(reference > 0, 1.0 - touches, touches * (reference < 0)).sum(-1)
 
 
 def wrapped(angle: Tensor) -> Tensor:
@@ -241,6 +256,12 @@ class Tracking:
         terms["power"] = -c.power * power
         changed = (memory["steps"] > 0) * (action - memory["action"]).square().mean(-1)
         terms["action_rate"] = -c.action_rate * changed
+
+        off = (body.pos[:, 0, 2] - reference.pos[:, 0, 2]).square()
+        terms["root_height"] = -c.root_height * (1.0 - torch.exp(-ROOT_SHARPNESS * off))
+        terms["contact"] = -c.contact * contact_mismatch(
+            view.touching()[:, 0], self.tables.contact(frame)
+        )
 
         apart = self._apart(view, reference)
         distance = torch.linalg.vector_norm(apart, dim=-1)  # (N, B)

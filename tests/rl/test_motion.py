@@ -102,3 +102,18 @@ def test_who_starts_in_the_ground_is_lifted_onto_it():
     assert lifted.any()
     torch.testing.assert_close(lowest[lifted], torch.zeros(int(lifted.sum())), atol=1e-5, rtol=0)
     physics.close()
+
+
+def test_who_stands_touches_with_the_feet_and_who_hovers_or_slides_does_not():
+    still = np.zeros((9, 76))
+    still[:, 2], still[:, 3] = BODY.standing_height(clearance=0.0), 1.0
+    frames = np.arange(9)[:, None]
+    high, gliding = still.copy(), still.copy()
+    high[:, 2:3] += 0.06
+    gliding[:, :1] = 0.5 / 30.0 * frames
+    motions = tables(*(Clip(30.0, "smpl", q, np.zeros((9, 75))) for q in (still, high, gliding)))
+    standing, hovering, sliding = motions.contact(torch.tensor([4, 14, 24]))
+    feet = [n.endswith(("Ankle", "Toe")) for n in BODY.link_names]
+    assert standing.tolist() == [1.0 if f else -1.0 for f in feet]
+    assert hovering.tolist() == [-1.0] * 24
+    assert sliding.tolist() == [0.0 if f else -1.0 for f in feet]

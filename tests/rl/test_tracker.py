@@ -14,6 +14,7 @@ from rl.motion import Reference
 from rl.tracker import (
     TrackingConfig,
     TrackingEnv,
+    contact_mismatch,
     goal_features,
     make_tracking_env,
     residual_targets,
@@ -116,6 +117,14 @@ def test_errors_of_hand_made_states():
     assert float(tracking_errors(body, body).abs().max()) < 1e-6
 
 
+def test_contacts_that_differ_are_counted():
+    reference = torch.tensor([[1.0, 1.0, -1.0, -1.0, 0.0, 0.0]])
+    touching = torch.tensor([[True, False, True, False, True, False]])
+    assert contact_mismatch(touching, reference).tolist() == [2.0]
+    assert contact_mismatch(reference > 0, reference).tolist() == [0.0]
+    assert contact_mismatch(reference <= 0, reference).tolist() == [4.0]
+
+
 def test_targets_lie_near_the_joint_whatever_turn_it_is_in():
     q = torch.tensor([0.1, 3.0, -3.0, 7.0, -9.0])
     reference = torch.tensor([0.2, -3.1, 3.1, 0.5, -2.9])
@@ -156,7 +165,8 @@ def test_who_follows_exactly_earns_one_and_never_ends():
         follows = sum(step.terms[n] for n in ("position", "rotation", "velocity", "spin"))
         torch.testing.assert_close(follows, torch.ones(2, 1), atol=2e-3, rtol=0)
         assert float(step.terms["power"].abs().max()) < 1e-4
-        assert float(step.terms["action_rate"].abs().max()) < 1e-6
+        for name in ("action_rate", "root_height", "contact"):
+            assert float(step.terms[name].abs().max()) < 1e-6
         assert not step.terminated.any()
         assert step.truncated is not None and bool(step.truncated.all()) == (frame == 49)
         assert float(step.metrics["mpjpe"].max()) < 0.01
@@ -187,6 +197,7 @@ def test_errors_of_an_athlete_who_lags_a_known_way_behind():
     assert float(step.metrics["mpjpe_local"]) == pytest.approx(0.0, abs=0.01)
     jolt = 1e3 * np.abs(x[2:] - 2 * x[1:-1] + x[:-2]).mean()
     assert float(step.metrics["acceleration_error"]) == pytest.approx(jolt, abs=0.02)
+    assert float(step.terms["root_height"]) == pytest.approx(0.0, abs=1e-6)
     k = env.tracking.sharpness[0]
     expected = 0.5 * torch.exp(-k * offsets[-1] ** 2)
     torch.testing.assert_close(step.terms["position"][0, 0], expected, atol=1e-4, rtol=0)
@@ -226,6 +237,7 @@ def test_episodes_end_off_the_reference_and_feet_may_be():
     class Physics:
         qpos, qvel = env.physics.qpos, env.physics.qvel
         body_rot = reference.rot[:, None]
+        ground_force = env.physics.ground_force
         body_linvel, body_angvel = reference.linvel[:, None], reference.angvel[:, None]
 
     def advance(link: str, metres: float):
