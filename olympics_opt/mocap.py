@@ -70,6 +70,9 @@ class Pack:
     them."""
     out: Path
     """The library, one npz."""
+    archives: tuple[str, ...] = ()
+    """Keep only these archives, as for a model without non-commercial data; by default all.
+    Demonstrations of ``solve`` are the archive ``demonstrations``."""
 
 
 def main(args: Sequence[str]) -> int:
@@ -103,6 +106,8 @@ def run_pack(config: Pack) -> int:
     from warmstart.library import pack_files
 
     library = pack_files(config.clips)
+    if config.archives:
+        library = library.only(config.archives)
     out = prepare(config.out)
     library.save(out)
     for archive, row in library.card()["archives"].items():

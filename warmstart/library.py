@@ -129,6 +129,15 @@ class Library:
             raise ValueError(f"none of the {len(self.origins)} clips is in the split '{name}'")
         return self.chosen(wanted)
 
+    def only(self, archives: Sequence[str]) -> Library:
+        """The clips of some archives, which stay in their splits. Raises ValueError for one that
+        is not there."""
+        have = sorted({o.archive for o in self.origins})
+        for name in archives:
+            if name not in have:
+                raise ValueError(f"there is no archive '{name}'; there are: {', '.join(have)}")
+        return self.chosen([i for i, o in enumerate(self.origins) if o.archive in archives])
+
     def card(self) -> dict[str, Any]:
         """What a model says about its data: archives with clips, minutes and licences; digest."""
         archives: dict[str, dict[str, Any]] = {}

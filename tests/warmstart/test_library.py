@@ -78,6 +78,15 @@ def test_the_split_is_by_the_hash_of_the_name():
     np.testing.assert_array_equal(some.qpos(1), library.qpos(2))
 
 
+def test_some_archives_can_be_kept():
+    library = pack(named(6))
+    some = library.only(["arch2", "arch0"])
+    assert [o.name for o in some.origins] == [f"arch{i % 3}/clip_{i}" for i in (0, 2, 3, 5)]
+    np.testing.assert_array_equal(some.qpos(3), library.qpos(5))
+    with pytest.raises(ValueError, match="no archive 'arch9'; there are: arch0, arch1, arch2"):
+        library.only(["arch0", "arch9"])
+
+
 def test_an_hour_fits_thirty_megabytes(tmp_path):
     # Noise cannot be compressed: no motion takes more.
     rng = np.random.default_rng(0)
