@@ -11,12 +11,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rl.motion import Reference
-from rl.tracker import (
-    TrackingConfig,
-    TrackingEnv,
+from rl.tracker import TrackingConfig, TrackingEnv, make_tracking_env
+from rl.tracking_terms import (
     contact_mismatch,
     goal_features,
-    make_tracking_env,
     residual_targets,
     tracking_errors,
     wrapped,
