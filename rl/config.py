@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from rl.amp import AMPConfig
 from rl.checkpoint import checkpoints, read_state
 from rl.ppo import PAPER, PPOConfig
 from sports.env import Env, Starts, make_env
@@ -30,8 +31,8 @@ class TrainConfig:
     """Name of the task."""
     out: Path = Path("runs/train")
     """Folder of the run."""
-    algo: Literal["ppo"] = "ppo"
-    """Learner."""
+    algo: Literal["ppo", "amp"] = "ppo"
+    """Learner: ppo, or amp, which also pays for moving like the ``clips``."""
     engine: Literal["mujoco", "warp", "drake"] = "mujoco"
     """Physics engine: mujoco needs no GPU, warp needs one, drake is for checking, not training."""
     worlds: int | None = None
@@ -62,7 +63,7 @@ class TrainConfig:
     init: str | None = None
     """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]."""
     clips: tuple[Path, ...] = ()
-    """Demonstrations (npz) from whose frames episodes may start."""
+    """Demonstrations (npz): their frames may start episodes, and amp learns their style."""
     start_probability: tuple[float, float] = (0.5, 0.1)
     """Share of episodes that start from a demonstration, at the beginning and end of the run."""
     imitation: float = 0.0
@@ -81,6 +82,8 @@ class TrainConfig:
     """Use the hyper-parameters of the SMPLOlympics paper instead of ``ppo``."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """Hyper-parameters."""
+    amp: AMPConfig = field(default_factory=AMPConfig)
+    """Hyper-parameters of the style, for ``--algo amp``."""
     device: str = "auto"
     """Where the networks live: auto (a GPU if there is one), cpu, cuda."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
@@ -104,6 +107,8 @@ class TrainConfig:
             raise ValueError("impact and impact_limit must not be negative")
         if not all(0.0 <= p <= 1.0 for p in self.start_probability):
             raise ValueError(f"start_probability must lie in [0, 1], not {self.start_probability}")
+        if self.algo != "amp" and self.amp != AMPConfig():
+            raise ValueError("the --amp options need --algo amp")
         if self.paper and self.ppo != PPOConfig():
             raise ValueError("--paper fixes the hyper-parameters: leave the --ppo options out")
 
@@ -211,10 +216,12 @@ def config_from_dict(data: dict[str, Any]) -> TrainConfig:
         ppo = dict(data.pop("ppo"))
         for name in ("hidden", "kl_band", "learning_rate_limits"):
             ppo[name] = tuple(ppo[name]) if ppo[name] is not None else None
+        amp = dict(data.pop("amp", {}))  # none in runs of versions without it
+        amp |= {"hidden": tuple(amp["hidden"])} if "hidden" in amp else {}
         data["out"] = Path(data["out"])
         data["clips"] = tuple(Path(p) for p in data["clips"])
         data["start_probability"] = tuple(data["start_probability"])
-        return TrainConfig(**data, ppo=PPOConfig(**ppo))
+        return TrainConfig(**data, ppo=PPOConfig(**ppo), amp=AMPConfig(**amp))
     except (TypeError, KeyError) as error:
         raise ValueError(f"the run's settings cannot be read ({error})") from error
 
