@@ -48,7 +48,7 @@ class AMPConfig:
     """Of the discriminator (Adam), constant."""
     steps: int = 8
     """Gradient steps of the discriminator per iteration."""
-    batch: int = 4096
+    batch: int = 2048
     """Windows of the rollout, of the replay and of the demonstrations in a step, each."""
     gradient_penalty: float = 5.0
     """Weight of the squared gradient at demonstrations."""

@@ -6,6 +6,10 @@ import csv
 import dataclasses
 import json
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -25,6 +29,7 @@ from tests.rl.spring import STEPS, Spring, demonstrations, law, moved, starts
 from tests.rl.test_train import same_bits
 from warmstart.bank import demonstration_files
 
+ROOT = Path(__file__).parents[2]
 CPU = torch.device("cpu")
 CLIP = next(f for f in demonstration_files("long_jump") if "5m" in f.name)
 SMALL = AMPConfig(hidden=(16,), batch=32, steps=2, replay=60, replay_share=0.2, frames=4)
@@ -257,3 +262,28 @@ def test_both_athletes_of_a_duel_are_paid_for_their_style(tmp_path):
     tensors = load_checkpoint(checkpoints(tmp_path)[-1])[1]
     assert tensors["style/tail"].shape[1] == tensors["style/age"].numel() == 6
     assert read_progress(tmp_path)[-1]["style/reward"] > 0.0
+
+
+def test_two_ranks_share_one_discriminator(tmp_path):
+    """gloo on the CPU: each has its own replay and windows, both the same network and features."""
+    args = ["long_jump", "--algo", "amp", "--clips", str(CLIP), "--out", str(tmp_path)]
+    args += ["--worlds", "4", "--samples", "288", "--quiet", "--ppo.hidden", "8"]
+    args += ["--ppo.steps", "12", "--ppo.minibatches", "2", "--ppo.epochs", "1"]
+    args += ["--amp.hidden", "16", "--amp.batch", "32", "--amp.frames", "4", "--device", "cpu"]
+    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    done = subprocess.run(
+        [sys.executable, *launch, "-m", "rl.train", *args],
+        cwd=ROOT,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    one, two = (load_checkpoint(checkpoints(tmp_path)[-1], rank)[1] for rank in (0, 1))
+    for name in one:
+        same = name.startswith(("style/net.", "style/adam.", "style/norm.total"))
+        if same:
+            assert torch.equal(one[name], two[name]), name
+    assert not torch.equal(one["style/replay.frames"], two["style/replay.frames"])
+    assert float(one["style/adam.head.weight.step"]) > 0.0
