@@ -10,7 +10,9 @@ Shapes: T steps, M rows (worlds x agents), H frames of a window, F features of a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import torch
@@ -22,7 +24,7 @@ from rl.graph import GraphedStep
 from rl.networks import MLP
 from rl.normalizer import Normalizer
 from rl.rollout import Rollout
-from rl.style_features import Demonstrations
+from rl.style_features import Athletes, Demonstrations, load_demonstrations
 
 
 @dataclass(frozen=True)
@@ -341,3 +343,23 @@ class AMP:
         self.frames[self.steps :] = state["tail"].to(self.frames)
         self._age.copy_(state["age"])
         self.generator.set_state(state["generator"].cpu())
+
+
+def of_athletes(
+    env: Any,
+    clips: Sequence[Path],
+    steps: int,
+    config: AMPConfig,
+    device: torch.device,
+    seed: int = 0,
+    cuda_graph: bool = True,
+    bf16: bool = False,
+) -> AMP:
+    """AMP for the athletes of an environment and demonstrations from files; the rest as for AMP.
+
+    Raises ValueError for clips that cannot serve, see rl.style_features.load_demonstrations.
+    """
+    shown = load_demonstrations(clips, env, config.frames, config.mirror)
+    rows = env.num_worlds * env.num_agents
+    source = Athletes(env, device)
+    return AMP(source, shown, rows, steps, config, device, seed, cuda_graph, bf16)

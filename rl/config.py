@@ -154,6 +154,18 @@ def load_starts(paths: tuple[Path, ...], probability: float) -> Starts:
     return ClipBank([Clip.load(path) for path in paths]).starts(probability=probability)
 
 
+def load_placed_starts(paths: tuple[Path, ...], probability: float) -> Starts | None:
+    """Starts from those of the clips that an optimisation put into the task's world, or None.
+
+    A captured motion shows a style wherever it was recorded; an episode cannot start there.
+    Raises ValueError for a file that is not a clip.
+    """
+    from warmstart.clip import Clip
+
+    placed = tuple(p for p in paths if "problem" in Clip.load(p).meta)
+    return load_starts(placed, probability) if placed else None
+
+
 FREE = {"out", "resume", "samples", "minutes", "quiet", "checkpoint_minutes"}
 FREE |= {"checkpoint_iterations", "device", "cuda_graph", "physics_options"}
 """What a resumed run may change; everything else is the run's own."""

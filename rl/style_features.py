@@ -19,7 +19,7 @@ from torch import Tensor
 
 from sports import quaternion
 from sports.frames import Heading
-from sports.humanoid.body import Body
+from sports.humanoid.body import Body, is_finger
 from warmstart.bank import Window
 from warmstart.clip import Clip
 
@@ -64,7 +64,7 @@ class StyleFeatures:
     angular velocity of the root (m/s, rad/s); rotation of each joint in 6-D (first two columns of
     its matrix, Zhou et al. 2019); hinge rates (rad/s); places of the key links from the root (m).
     The root's height is left out, as in the SMPLOlympics paper: a jump is higher than its
-    demonstration.
+    demonstration. Fingers are left out too: a grasp is the task's, and the clip does not have it.
     """
 
     def __init__(self, body: Body, device: torch.device | str = "cpu") -> None:
@@ -75,6 +75,7 @@ class StyleFeatures:
         self.num_dofs = body.num_dofs
         self.keys = key_links(body)
         parents, names = body.parents(), body.link_names
+        shown = [i for i in range(1, len(names)) if not is_finger(names[i])]
         wanted: set[int] = set()
         for name in self.keys:
             i = names.index(name)
@@ -97,7 +98,8 @@ class StyleFeatures:
             offset = torch.tensor([body.links[i].offset for i in links], device=device)
             self._levels.append((index([i - 1 for i in links]), parent, offset[..., None]))
         self._key_places = index([place[names.index(name)] for name in self.keys])
-        self.size = 12 + 6 * (body.num_links - 1) + self.num_dofs + 3 * len(self.keys)
+        self._joints = index([i - 1 for i in shown])
+        self.size = 12 + 9 * len(shown) + 3 * len(self.keys)
         """Features F of a frame."""
 
     def __call__(self, state: Tensor) -> Tensor:
@@ -123,8 +125,8 @@ class StyleFeatures:
             columns[..., :2, :],
             heading.local(qvel[..., :3]),
             heading.local(spin),
-            joints[..., :2].transpose(-1, -2),
-            qvel[..., 6:],
+            joints.index_select(-3, self._joints)[..., :2].transpose(-1, -2),
+            qvel[..., 6:].unflatten(-1, (-1, 3)).index_select(-2, self._joints),
             places.index_select(-2, self._key_places),
         )
         return torch.cat([p.reshape(*shape, -1) for p in parts], -1)

@@ -28,6 +28,7 @@ from rl.config import (
     MakeEnv,
     TrainConfig,
     default_env,
+    load_placed_starts,
     load_starts,
     parse_args,
     settle,
@@ -41,7 +42,6 @@ from rl.policy import load_policy
 from rl.ppo import PPO, STATISTICS
 from rl.rollout import collect
 from rl.runlog import Row, RunLog
-from rl.style_features import Athletes, load_demonstrations
 from sports.env import Starts
 from warmstart.atomic import write_text
 
@@ -120,9 +120,9 @@ class _Trainer:
             config = replace(config, ppo=replace(config.ppo, **shape))
         self.config, self.hyper = config, config.hyper
         self.env = environment(config, config.seed + 7919 * self.rank)
-        wants_starts = config.algo != "amp" or any(config.start_probability) or config.imitation
-        if starts is None and config.clips and wants_starts:
-            starts = load_starts(config.clips, config.start_probability[0])
+        if starts is None and config.clips:
+            load = load_placed_starts if config.algo == "amp" else load_starts
+            starts = load(config.clips, config.start_probability[0])
         if starts is not None:
             self.env.starts = starts.to(self.env.device)
         self.imitation: Imitation | None = None
@@ -145,7 +145,12 @@ class _Trainer:
         )
         self.rollout = self.agent.new_rollout(rows)
         self.meter = EpisodeMeter(self.env)
-        self.style = self._make_style(rows) if config.algo == "amp" else None
+        self.style: amp.AMP | None = None
+        if config.algo == "amp":
+            device, how = self.device, (config.seed, config.cuda_graph, self.agent.bf16)
+            self.style = amp.of_athletes(
+                self.env, config.clips, self.hyper.steps, config.amp, device, *how
+            )
         self.samples_each = self.hyper.steps * rows * self.ranks
         self.iteration, self.samples, self.minutes = 0, 0, 0.0
         self.metrics: dict[str, float] = {}
@@ -162,22 +167,6 @@ class _Trainer:
                 self.warmup = 0 if critic else self.hyper.critic_warmup
         # Without any statistics the first rollout is for the observation normaliser only.
         self.first_learning = 0 if config.init else 1
-
-    def _make_style(self, rows: int) -> amp.AMP:
-        """The discriminator of ``--algo amp``. Raises ValueError for clips that cannot serve."""
-        c = self.config.amp
-        shown = load_demonstrations(self.config.clips, self.env, c.frames, c.mirror)
-        return amp.AMP(
-            Athletes(self.env, self.device),
-            shown,
-            rows,
-            self.hyper.steps,
-            c,
-            self.device,
-            self.config.seed,
-            self.config.cuda_graph,
-            self.agent.bf16,
-        )
 
     def _watch(self, result: Any) -> None:
         self.meter(result)

@@ -9,9 +9,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from rl.style_features import Athletes, load_demonstrations
+from rl.config import load_placed_starts, load_starts
+from rl.style_features import Athletes, StyleFeatures, load_demonstrations
 from rl.train import main
 from sports.env import make_env
+from sports.humanoid.body import load_body
 from sports.physics import PhysicsState
 from warmstart.bank import demonstration_files
 from warmstart.clip import Clip
@@ -51,13 +53,16 @@ def expected(env, agent: int, world: int) -> np.ndarray:
         return np.concatenate((rotation.apply([1.0, 0, 0]), rotation.apply([0, 1.0, 0])))
 
     parents = body.parents()
-    joints = [two_columns(links[int(parents[i])].inv() * links[i]) for i in range(1, len(pos))]
-    hinges = p.qvel[world, p.scene.agent_qvel(agent)][6:].double().numpy()
+    fingers = ("Index", "Middle", "Pinky", "Ring", "Thumb")
+    shown = [i for i, n in enumerate(body.link_names) if i and n[2:-1] not in fingers]
+    joints = [two_columns(links[int(parents[i])].inv() * links[i]) for i in shown]
+    rates = p.qvel[world, p.scene.agent_qvel(agent)][6:].double().numpy()
+    hinges = [rates[3 * (i - 1) : 3 * i] for i in shown]
     hand = "Hand" if "L_Hand" in body.link_names else "Middle1"
     names = [s + n for s in ("L_", "R_") for n in ("Ankle", "Toe", "Wrist", hand)]
     keys = [back.apply(pos[body.link_index(n)] - pos[0]) for n in names]
     root = (two_columns(back * links[0]), back.apply(linear[0]), back.apply(angular[0]))
-    return np.concatenate((*root, *joints, hinges, *keys))
+    return np.concatenate((*root, *joints, *hinges, *keys))
 
 
 @pytest.mark.parametrize("task", ["long_jump", "boxing", "javelin"])
@@ -170,6 +175,34 @@ def test_clips_that_cannot_serve_are_refused_in_one_sentence(case, words, tmp_pa
     assert message.startswith("error: ") and words in message
     assert message.count("\n") == 1
     assert not (tmp_path / "run").exists()
+
+
+def test_fingers_do_not_show():
+    """A grasp is the task's: no clip has it."""
+    body = load_body("smplx")
+    features = StyleFeatures(body)
+    n = body.num_dofs
+    rows = [i for i, d in enumerate(body.dofs) if d.link[2:] in ("Index1", "Thumb2", "Ring3")]
+    assert len(rows) == 18
+    straight = torch.zeros(13 + 2 * n)
+    straight[3] = 1.0
+    bent = straight.clone()
+    bent[[7 + i for i in rows]] = 0.8
+    bent[[13 + n + i for i in rows]] = 3.0
+    assert torch.equal(features(bent), features(straight))
+    bent[7 + body.dof_index("L_Wrist_x")] = 0.8
+    assert not torch.equal(features(bent), features(straight))
+
+
+def test_captured_clips_start_no_episode(tmp_path):
+    """They are not in the task's world; those of an optimisation are."""
+    clip = Clip.load(CLIP)
+    captured = tmp_path / "captured.npz"
+    dataclasses.replace(clip, meta={"source": "somebody"}).save(captured)
+    assert load_placed_starts((captured,), 0.5) is None
+    both = load_placed_starts((captured, CLIP), 0.5)
+    assert both is not None
+    assert torch.equal(both.qpos, load_starts((CLIP,), 0.5).qpos)
 
 
 def test_options_of_the_style_need_the_style(tmp_path, capsys):
