@@ -84,6 +84,8 @@ STATISTICS = (
     "style/masked",
 )
 """What ``AMP.update`` reports."""
+ABSURD = 1e6
+"""No feature is larger."""
 
 
 def style_bonus(task: Tensor, style: Tensor, config: AMPConfig) -> Tensor:
@@ -198,8 +200,10 @@ class AMP:
         h = self.config.frames
         self.frames[: h - 1] = self.frames[self.steps :].clone()
         features = self.source.features(self._states)
-        self.frames[h - 1 :] = torch.nan_to_num(features, posinf=0.0, neginf=0.0)
-        style = torch.stack([self._style(t) for t in range(self.steps)])
+        # Of a world that diverged anything may come; such frames are in no window that counts.
+        self.frames[h - 1 :] = torch.nan_to_num(features).clamp(-ABSURD, ABSURD)
+        seen = self.norm.normalize(self.frames.float())
+        style = torch.stack([self._style(seen[t : t + h]) for t in range(self.steps)])
         style = torch.where(self.whole, style, 0.0)
         bonus = style_bonus(self._task, style, self.config)
         rollout.reward += bonus / scale
@@ -207,11 +211,10 @@ class AMP:
         share = spent / (spent + self._task.abs().mean()).clamp(min=1e-8)
         self._paid = (style.mean() / whole.clamp(min=1e-8), share, 1.0 - whole)
 
-    def _style(self, t: int) -> Tensor:
-        """(M,) style reward of the windows that end with step t."""
-        window = self.frames[t : t + self.config.frames].transpose(0, 1)
+    def _style(self, window: Tensor) -> Tensor:
+        """(H, M, F) normalised frames -> (M,) style reward."""
         with self._autocast():
-            return style_reward(self.net(self._normalized(window)).squeeze(-1))
+            return style_reward(self.net(window.transpose(0, 1).flatten(1)).squeeze(-1))
 
     def _normalized(self, windows: Tensor) -> Tensor:
         """(m, H, F) windows -> (m, H F) input of the discriminator, float32."""

@@ -16,7 +16,7 @@ from sports.env import make_env
 from sports.humanoid.body import load_body
 from sports.physics import PhysicsState
 from warmstart.bank import demonstration_files
-from warmstart.clip import Clip
+from warmstart.clip import Clip, finite_difference_qvel
 
 CLIP = next(f for f in demonstration_files("long_jump") if "5m" in f.name)
 
@@ -117,6 +117,32 @@ def test_velocities_are_the_stored_ones_and_no_difference_quotients():
     torch.testing.assert_close(shown[0, 6:9], qvel[:3])  # it stands along x
     torch.testing.assert_close(shown[0, 9:12], qvel[3:6])
     env.close()
+
+
+def test_a_motion_repeated_by_the_engine_shows_what_its_clip_shows():
+    """The discriminator must not know simulated from stored velocities: played with its own
+    targets, a demonstration has the features of its clip. Difference quotients would not do."""
+    env = make_env("long_jump", num_worlds=1, strength="human", training=False)
+    athletes, physics = Athletes(env, "cpu"), env.physics
+    clip = Clip.load(CLIP)
+    assert clip.ctrl is not None and clip.fps == 30.0
+    state = PhysicsState(physics.qpos.clone(), physics.qvel.clone(), physics.mocap_pos.clone())
+    state.qpos[0], state.qvel[0] = torch.tensor(clip.qpos[0]), torch.tensor(clip.qvel[0])
+    physics.reset(torch.ones(1, dtype=torch.bool), state)
+    found = []
+    for target in clip.ctrl[:20]:
+        physics.step(torch.tensor(target[None]).float())
+        env.final_snapshot = env.snapshot()
+        found.append(athletes.features(athletes.state())[0])
+    env.close()
+
+    def of(qvel: np.ndarray) -> torch.Tensor:
+        states = np.concatenate((clip.qpos, qvel), -1)[1:21]
+        return athletes.features(torch.tensor(states).float())
+
+    torch.testing.assert_close(torch.stack(found), of(clip.qvel), rtol=1e-4, atol=1e-3)
+    quotients = finite_difference_qvel(physics.scene.body, clip.qpos, clip.fps)
+    assert (torch.stack(found) - of(quotients)).abs().max() > 1.0
 
 
 def test_demonstrations_are_windows_at_the_control_rate(tmp_path):
