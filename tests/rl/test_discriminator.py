@@ -26,7 +26,7 @@ def test_gradient_penalty_of_a_linear_discriminator_is_its_squared_weight():
         net.head.weight.copy_(w)
     x = torch.randn(50, 6, generator=torch.Generator().manual_seed(0))
     losses = discriminator_losses(net, x, torch.ones(50), 3.0 * x + 7.0)
-    assert float(losses.gradient) == pytest.approx(float(w.square().sum()), rel=1e-6)
+    assert losses.gradient.item() == pytest.approx(float(w.square().sum()), rel=1e-6)
     losses.gradient.backward()
     torch.testing.assert_close(net.head.weight.grad[0], 2.0 * w)
 
