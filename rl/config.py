@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from rl.amp import AMPConfig
 from rl.checkpoint import checkpoints, read_state
 from rl.ppo import PAPER, PPOConfig
 from sports.env import Env, Starts, make_env
@@ -32,8 +33,8 @@ class TrainConfig:
     """Name of the task."""
     out: Path = Path("runs/train")
     """Folder of the run."""
-    algo: Literal["ppo"] = "ppo"
-    """Learner."""
+    algo: Literal["ppo", "amp"] = "ppo"
+    """Learner: ppo, or amp, which also pays for moving like the ``clips``."""
     engine: Literal["mujoco", "warp", "drake"] = "mujoco"
     """Physics engine: mujoco needs no GPU, warp needs one, drake is for checking, not training."""
     worlds: int | None = None
@@ -64,8 +65,8 @@ class TrainConfig:
     init: str | None = None
     """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]."""
     clips: tuple[Path, ...] = ()
-    """Demonstrations (npz) from whose frames episodes may start; for the task ``tracking`` the
-    motions to follow: a packed library, or clips and folders of them."""
+    """Demonstrations (npz): their frames may start episodes, and amp learns their style; for the
+    task ``tracking`` the motions to follow: a packed library, or clips and folders of them."""
     start_probability: tuple[float, float] = (0.5, 0.1)
     """Share of episodes that start from a demonstration, at the beginning and end of the run."""
     imitation: float = 0.0
@@ -84,6 +85,8 @@ class TrainConfig:
     """Use the hyper-parameters of the SMPLOlympics paper instead of ``ppo``."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
     """Hyper-parameters."""
+    amp: AMPConfig = field(default_factory=AMPConfig)
+    """Hyper-parameters of the style, for ``--algo amp``."""
     device: str = "auto"
     """Where the networks live: auto (a GPU if there is one), cpu, cuda."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
@@ -107,6 +110,10 @@ class TrainConfig:
             raise ValueError("impact and impact_limit must not be negative")
         if not all(0.0 <= p <= 1.0 for p in self.start_probability):
             raise ValueError(f"start_probability must lie in [0, 1], not {self.start_probability}")
+        if self.algo != "amp" and self.amp != AMPConfig():
+            raise ValueError("the --amp options need --algo amp")
+        if self.algo == "amp" and self.task == TRACKING:
+            raise ValueError("the tracker follows its clips frame by frame: leave --algo amp out")
         if self.paper and self.ppo != PPOConfig():
             raise ValueError("--paper fixes the hyper-parameters: leave the --ppo options out")
 
@@ -175,6 +182,18 @@ def load_starts(paths: tuple[Path, ...], probability: float) -> Starts:
     return ClipBank([Clip.load(path) for path in paths]).starts(probability=probability)
 
 
+def load_placed_starts(paths: tuple[Path, ...], probability: float) -> Starts | None:
+    """Starts from those of the clips that an optimisation put into the task's world, or None.
+
+    A captured motion shows a style wherever it was recorded; an episode cannot start there.
+    Raises ValueError for a file that is not a clip.
+    """
+    from warmstart.clip import Clip
+
+    placed = tuple(p for p in paths if "problem" in Clip.load(p).meta)
+    return load_starts(placed, probability) if placed else None
+
+
 FREE = {"out", "resume", "samples", "minutes", "quiet", "checkpoint_minutes"}
 FREE |= {"checkpoint_iterations", "device", "cuda_graph", "physics_options"}
 """What a resumed run may change; everything else is the run's own."""
@@ -238,10 +257,12 @@ def config_from_dict(data: dict[str, Any]) -> TrainConfig:
         ppo = dict(data.pop("ppo"))
         for name in ("hidden", "kl_band", "learning_rate_limits"):
             ppo[name] = tuple(ppo[name]) if ppo[name] is not None else None
+        amp = dict(data.pop("amp", {}))  # none in runs of versions without it
+        amp |= {"hidden": tuple(amp["hidden"])} if "hidden" in amp else {}
         data["out"] = Path(data["out"])
         data["clips"] = tuple(Path(p) for p in data["clips"])
         data["start_probability"] = tuple(data["start_probability"])
-        return TrainConfig(**data, ppo=PPOConfig(**ppo))
+        return TrainConfig(**data, ppo=PPOConfig(**ppo), amp=AMPConfig(**amp))
     except (TypeError, KeyError) as error:
         raise ValueError(f"the run's settings cannot be read ({error})") from error
 

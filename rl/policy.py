@@ -25,6 +25,8 @@ from warmstart.atomic import write_bytes, write_text
 
 FORMAT = "olympics-opt policy 1"
 BASELINES = ("zero", "random")
+ALGORITHMS = ("ppo", "amp")
+"""Those whose actor turns an observation into PD targets, which is what a policy is here."""
 MAX_WIDTH, MAX_LAYERS = 1 << 16, 32
 _REQUIRED = {
     "format": str,
@@ -204,6 +206,11 @@ def _build(card: dict[str, Any], weights: dict[str, Tensor], where: str) -> Poli
             value = float(value)
         if not isinstance(value, kind):
             raise PolicyError(f"the card of policy '{where}' lacks a proper '{name}'")
+    if card["algo"] not in ALGORITHMS:
+        raise PolicyError(
+            f"the policy '{where}' is of algorithm '{card['algo']}', which cannot be played or "
+            f"trained on here: use one of {', '.join(ALGORITHMS)}"
+        )
     sizes = [card["obs_size"], *card["hidden"], card["action_size"]]
     if len(sizes) > MAX_LAYERS or not all(isinstance(n, int) and 0 < n < MAX_WIDTH for n in sizes):
         raise PolicyError(f"the card of policy '{where}' has impossible layer sizes {sizes}")

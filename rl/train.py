@@ -21,7 +21,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from rl import provenance
+from rl import amp, provenance
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
 from rl.config import (
     DEFAULT_SAMPLES,
@@ -29,6 +29,7 @@ from rl.config import (
     MakeEnv,
     TrainConfig,
     default_env,
+    load_placed_starts,
     load_starts,
     parse_args,
     settle,
@@ -121,7 +122,8 @@ class _Trainer:
         self.config, self.hyper = config, config.hyper
         self.env = environment(config, config.seed + 7919 * self.rank)
         if starts is None and config.clips and config.task != TRACKING:
-            starts = load_starts(config.clips, config.start_probability[0])
+            load = load_placed_starts if config.algo == "amp" else load_starts
+            starts = load(config.clips, config.start_probability[0])
         if starts is not None:
             self.env.starts = starts.to(self.env.device)
         self.imitation: Imitation | None = None
@@ -144,6 +146,12 @@ class _Trainer:
         )
         self.rollout = self.agent.new_rollout(rows)
         self.meter = EpisodeMeter(self.env)
+        self.style: amp.AMP | None = None
+        if config.algo == "amp":
+            device, how = self.device, (config.seed, config.cuda_graph, self.agent.bf16)
+            self.style = amp.of_athletes(
+                self.env, config.clips, self.hyper.steps, config.amp, device, *how
+            )
         self.samples_each = self.hyper.steps * rows * self.ranks
         self.iteration, self.samples, self.minutes = 0, 0, 0.0
         self.metrics: dict[str, float] = {}
@@ -160,6 +168,11 @@ class _Trainer:
                 self.warmup = 0 if critic else self.hyper.critic_warmup
         # Without any statistics the first rollout is for the observation normaliser only.
         self.first_learning = 0 if config.init else 1
+
+    def _watch(self, result: Any) -> None:
+        self.meter(result)
+        if self.style is not None:
+            self.style.watch(result)
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -231,15 +244,18 @@ class _Trainer:
                 self.rollout,
                 self.obs,
                 self.hyper.gamma,
-                on_step=self.meter,
+                on_step=self._watch,
                 bonuses=self.bonuses,
             )
+        if self.style is not None:
+            self.style.pay(self.rollout, self.env.reward_scale)
         clock.mark()
         losses: dict[str, Tensor] = {}
         if self.iteration < self.first_learning:
             self.agent.obs_norm.commit()
         else:
             losses = self.agent.update(self.rollout)
+            losses |= self.style.update() if self.style is not None else {}
         clock.mark()
         row: Row = {"iteration": self.iteration + 1}
         rates = {"learning_rate": self.agent.learning_rate, "sigma": self.agent.sigma}
@@ -277,6 +293,7 @@ class _Trainer:
             "rollout_s": rollout_s,
             "update_s": update_s,
             **dict.fromkeys(STATISTICS),
+            **dict.fromkeys(amp.STATISTICS if self.style is not None else ()),
             **losses_now,
             **summary,
         }
@@ -364,6 +381,8 @@ class _Trainer:
         tensors = {f"agent/{k}": v for k, v in self.agent.state_dict().items()}
         tensors |= {f"env/{k}": v for k, v in self.env.state_dict().items()}
         tensors |= {f"meter/{k}": v for k, v in self.meter.state_dict().items()}
+        if self.style is not None:
+            tensors |= {f"style/{k}": v for k, v in self.style.state_dict().items()}
         tensors["obs"] = self.obs
         barrier = dist.barrier if self.ranks > 1 else None
         return save_checkpoint(self.config.out, self.iteration, state, tensors, self.rank, barrier)
@@ -384,6 +403,8 @@ class _Trainer:
         self.agent.load_state_dict(part("agent/"))
         self.env.load_state_dict(part("env/"))
         self.meter.load_state_dict(part("meter/"))
+        if self.style is not None:
+            self.style.load_state_dict(part("style/"))
         self.iteration, self.samples = state["iteration"], state["samples"]
         self.minutes, self.warmup = state["minutes"], state["warmup"]
         self.metrics = state["card"]["metrics"]
