@@ -20,7 +20,7 @@ from sports.humanoid.body import Limits, Strength, load_body
 from sports.physics import Physics, PhysicsState, default_state, make_physics
 from sports.registry import get_task, make_config
 from sports.scene import Scene
-from sports.starts import Starts, Stock, add_noise
+from sports.starts import ELAPSED, Starts, Stock, add_noise
 from sports.task import Memory, Task, View, falling_forces, falling_heights
 
 no_autograd = getattr(torch._C, "_AutoDispatchBelowAutograd", contextlib.nullcontext)
@@ -215,8 +215,9 @@ class Env:
     def _reset(self, mask: Tensor) -> None:
         state, context = self._draw()
         self.physics.reset(mask, state)
-        self.view.clock = self.view.clock.masked_fill(mask, 0)
-        self.age = self.age.masked_fill(mask, 0)
+        begun = self._clock(context)
+        self.view.clock = torch.where(mask, begun, self.view.clock)
+        self.age = torch.where(mask, begun, self.age)
         self.view.refresh()
         fresh = self.task.begin(self.view, context)
         self.memory = _renewed(mask, fresh, self.memory or fresh)
@@ -228,8 +229,8 @@ class Env:
             stock = self._stock = self._prepare(*self._draw())
         stock.used.numpy()[worlds.numpy()] = True
         cast(Any, self.physics).restart(worlds, stock.shown)
-        self.view.clock = self.view.clock.index_fill(0, worlds, 0)
-        self.age = self.age.index_fill(0, worlds, 0)
+        self.view.clock = self.view.clock.index_copy(0, worlds, stock.clock[worlds])
+        self.age = self.age.index_copy(0, worlds, stock.clock[worlds])
         self.view.refresh()
         self.memory = _renewed(mask, stock.memory, self.memory)
         # On a CPU, where alone this is called, numpy is three times as quick with a few rows.
@@ -239,12 +240,14 @@ class Env:
 
     def _prepare(self, state: PhysicsState, context: Memory) -> Stock:
         shown = cast(Any, self.physics).prepare(state)
-        view = dataclasses.replace(self.view, physics=shown)
+        clock = self._clock(context)
+        view = dataclasses.replace(self.view, physics=shown, clock=clock)
         view.refresh()
         fresh = self.task.begin(view, context)
         return Stock(
             state=state,
             context=context,
+            clock=clock,
             shown=shown,
             memory={k: v.to(self.memory[k].dtype) for k, v in fresh.items()},
             obs=self._observe(view, fresh),
@@ -257,8 +260,20 @@ class Env:
         state, scene = self._default.clone(), self.physics.scene
         if self.training:
             add_noise(state, scene, self.generator)
-        context = self.starts.draw(state, scene, self.generator) if self.starts else {}
-        return self.task.start(self.view, state, context, self.generator, self.training)
+        labels = self.starts.draw(state, scene, self.generator) if self.starts else {}
+        state, context = self.task.start(
+            self.view, state, labels, self.generator, self.training
+        )
+        if ELAPSED in labels:
+            context = context | {ELAPSED: labels[ELAPSED]}
+        return state, context
+
+    def _clock(self, context: Memory) -> Tensor:
+        """(N,) control steps since the rules' beginning of the episodes that start so."""
+        if ELAPSED not in context:
+            return torch.zeros_like(self.view.clock)
+        steps = (context[ELAPSED] / self.view.control_timestep).nan_to_num(0.0)
+        return steps.round().long()
 
     def _observe(self, view: View | None = None, memory: Memory | None = None) -> Tensor:
         """(n, A, obs) of a view's worlds; by default of all."""

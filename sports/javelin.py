@@ -93,11 +93,13 @@ def scene(config: Javelin, body: Body) -> Scene:
 
 
 def begin(view: View, context: Memory) -> Memory:
-    """Memory after a reset: in the hand."""
+    """Memory after a reset: in the hand. In the middle of a throw, too, the start is where the
+    athlete of the scene stands."""
     ends, speeds = _ends(view)
     zero = torch.zeros_like(ends[:, 0, 0])
+    start = constant(view.physics.scene.start_qpos[:3], zero.device)
     return {
-        "start": view.root_pos[:, 0].clone(),
+        "start": start.expand(len(zero), 3).clone(),
         "x": view.physics.object_pos[:, 0, 0].clone(),
         "ends": ends,
         "speeds": speeds,

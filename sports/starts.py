@@ -14,6 +14,9 @@ from sports.task import Memory, constant
 
 START_NOISE = 0.02
 """Joint noise of a training start (rad), uniform."""
+ELAPSED = "elapsed"
+"""Label of a frame in the middle of an episode: seconds since the episode began. Rules that depend
+on the task's clock (``View.clock``) go on from there; NaN for an episode that begins."""
 
 
 @dataclass
@@ -25,7 +28,8 @@ class Starts:
     qvel: Tensor
     """(F, 6 + num_dofs)"""
     context: dict[str, Tensor]
-    """(F,) labels of the frame's demonstration that the task understands (``bar_height``)."""
+    """(F,) labels of the frame's demonstration that the task understands (``bar_height``), and
+    ``ELAPSED``."""
     probability: float = 0.5
     """Share of resets that start from a frame."""
     object_qpos: Tensor | None = None
@@ -92,6 +96,8 @@ class Stock:
     state: PhysicsState
     context: Memory
     """Of ``Task.begin``."""
+    clock: Tensor
+    """(N,) long: control steps of the episode that are over."""
     shown: Any
     """The engine's, of the state."""
     memory: Memory

@@ -33,7 +33,8 @@ class View:
     config: Any
     curriculum: Memory
     clock: Tensor
-    """(N,) control steps since the reset; 1 after the first step."""
+    """(N,) control steps since the episode began: 0 after a reset to the task's own start, more
+    where it starts from a frame in the middle of a throw (``sports.starts.ELAPSED``)."""
     control_timestep: float
     lowest: Tensor
     """(B,) heights (m) below which a link's origin means a fall; -inf for ankles, toes, tools."""

@@ -18,6 +18,7 @@ import torch
 
 from sports.env import Starts
 from sports.humanoid.body import load_body
+from sports.starts import ELAPSED
 from warmstart.clip import Clip
 from warmstart.outcome import lowest
 from warmstart.problems import get_problem
@@ -25,6 +26,9 @@ from warmstart.problems import get_problem
 DATA = "data"
 CONTEXT = {"high_jump": ("bar_height",), "hurdling": ("hurdle_height",)}
 """Labels of a clip that its task understands as context of a start, by task."""
+
+START = "start"
+"""Event of a clip: when the episode began that it is of, by the task's own start."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,8 @@ class ClipBank:
         """Frames of all clips as start states, each with the labels of its clip.
 
         ``context`` names labels besides those of the clips' tasks; a clip without one has NaN
-        there, which a task reads as "draw your own". Frames that reach more than ``floor`` (m)
+        there, which a task reads as "draw your own". A clip with an event ``start`` says when its
+        episode began, and its frames how long ago that was. Frames that reach more than ``floor`` (m)
         below the ground are left out; a loaded foot sinks up to 1 cm at a take-off. Raises
         ValueError when no frame is left, a label is not a number or the clips differ in objects.
         """
@@ -93,7 +98,9 @@ class ClipBank:
         body = load_body(self.body)
         names = list(context)
         for clip in self.clips:
-            names += [n for n in CONTEXT.get(clip.meta.get("problem", ""), ()) if n not in names]
+            own = CONTEXT.get(clip.meta.get("problem", ""), ())
+            own += (ELAPSED,) if START in clip.meta.get("events", {}) else ()
+            names += [n for n in own if n not in names]
         qpos, qvel, labels, things = [], [], [], []
         counts = {clip.num_objects for clip in self.clips} - {0}
         if len(counts) > 1:
@@ -104,7 +111,18 @@ class ClipBank:
             rows = rows[lowest(body, clip.qpos[rows]) >= -floor] if rows.size else rows
             qpos.append(clip.qpos[rows])
             qvel.append(clip.qvel[rows])
-            labels.append(np.tile([label(clip, name) for name in names], (len(rows), 1)))
+            labels.append(
+                np.column_stack(
+                    [
+                        elapsed(clip)[rows]
+                        if name == ELAPSED
+                        else np.full(len(rows), label(clip, name))
+                        for name in names
+                    ]
+                )
+                if names
+                else np.zeros((len(rows), 0))
+            )
             if clip.object_qpos is not None and clip.object_qvel is not None:
                 things.append(np.hstack([clip.object_qpos[rows], clip.object_qvel[rows]]))
             else:
@@ -127,6 +145,12 @@ class ClipBank:
             object_qpos=tensor(objects[:, : 7 * count]) if count else None,
             object_qvel=tensor(objects[:, 7 * count :]) if count else None,
         )
+
+
+def elapsed(clip: Clip) -> np.ndarray:
+    """(T,) seconds since the beginning of the episode that the clip is of, NaN without one."""
+    begun = float(clip.meta.get("events", {}).get(START, np.nan))
+    return clip.times - begun
 
 
 def label(clip: Clip, name: str) -> float:

@@ -8,7 +8,9 @@ import torch
 from sports import quaternion
 from sports.env import make_env
 from sports.humanoid.hold import JAVELIN_LENGTH, JAVELIN_RADIUS
+from sports.javelin import RELEASE_STEPS
 from sports.physics import PhysicsState
+from sports.starts import ELAPSED, Starts
 from tests.sports.hand_made import HandMade
 
 STANDING = 0.9483
@@ -433,3 +435,83 @@ def test_action_zero_holds_the_javelin_until_it_should_have_been_thrown(strength
         if step < 18:
             assert (result.reward > 0.98).all()
     env.close()
+
+
+# Starts in the middle of a throw.
+
+
+def begun(elapsed: list[float], probability: float = 1.0, worlds: int = 8, place=None):
+    """Worlds that start from the hold, so long (s) after the beginning of their episodes, with the
+    javelin in the hand or elsewhere (m)."""
+    probe = make_env("javelin", num_worlds=1, training=False, physics_options={"threads": 1})
+    scene, n = probe.physics.scene, len(elapsed)
+    state = probe.physics.qpos[0], probe.physics.qvel[0]
+    starts = Starts(
+        qpos=state[0][scene.agent_qpos(0)].repeat(n, 1),
+        qvel=state[1][scene.agent_qvel(0)].repeat(n, 1),
+        context={ELAPSED: torch.tensor(elapsed)},
+        probability=probability,
+        object_qpos=state[0][scene.object_qpos("javelin")].repeat(n, 1),
+        object_qvel=state[1][scene.object_qvel("javelin")].repeat(n, 1),
+    )
+    probe.close()
+    assert starts.object_qpos is not None
+    if place is not None:
+        starts.object_qpos[:, :3] = torch.tensor(place)
+    return make_env(
+        "javelin", num_worlds=worlds, seed=3, starts=starts, physics_options={"threads": 1}
+    )
+
+
+def test_a_start_in_the_middle_of_a_throw_goes_on_with_its_clock():
+    """At 0.5 s the javelin must be held for three more steps; at 1.5 s it must be off the hand in
+    three; without a label the clock starts at 0."""
+    for elapsed, left in ((0.5, None), (1.5, RELEASE_STEPS - 45), (math.nan, None)):
+        env = begun([elapsed])
+        steps = 0 if math.isnan(elapsed) else round(30 * elapsed)
+        assert env.view.clock.tolist() == env.age.tolist() == [steps] * 8
+        assert torch.equal(env.memory["start"][:, :2], torch.zeros(8, 2))
+        hold = torch.zeros(8, 1, env.action_size)
+        for step in range(1, 5):
+            result = env.step(hold)
+            assert result.terminated.all() == (step == left)
+            if step == left:  # and the next episodes begin at 1.5 s too
+                assert env.view.clock.tolist() == env.age.tolist() == [steps] * 8
+                break
+            assert not result.terminated.any()
+            assert env.view.clock.tolist() == [steps + step] * 8
+        env.close()
+
+
+def test_a_javelin_out_of_the_hand_is_lost_only_while_it_must_be_held():
+    for elapsed, lost in ((0.0, True), (0.5, True), (0.6, False), (math.nan, True)):
+        env = begun([elapsed], place=FAR)
+        result = env.step(torch.zeros(8, 1, env.action_size))
+        assert result.terminated.all() == result.terminated.any() == lost
+        assert env.memory["released"].all() != lost
+        env.close()
+
+
+def test_clocks_of_mixed_starts_survive_automatic_resets_and_a_checkpoint():
+    """Starts are worked out ahead of need: each world must get the clock of its own frame."""
+    env = begun([1.0, 1.4], probability=0.7, worlds=16)
+    clocks = set()
+    hold = torch.zeros(16, 1, env.action_size)
+    for _ in range(60):
+        before = env.view.clock.clone()
+        result = env.step(hold)
+        fresh = env.view.clock[result.ended]
+        clocks |= set(fresh.tolist())
+        assert (env.view.clock == before + 1)[~result.ended].all()
+        assert (before[result.ended] + 1 >= RELEASE_STEPS).all()
+    assert clocks == {0, 30, 42}
+    saved = env.state_dict()
+    twin = begun([1.0, 1.4], probability=0.7, worlds=16)
+    twin.load_state_dict(saved)
+    for _ in range(50):
+        ours, theirs = env.step(hold), twin.step(hold)
+        assert torch.equal(ours.ended, theirs.ended)
+        assert torch.equal(env.view.clock, twin.view.clock)
+        assert torch.equal(env.age, twin.age)
+    env.close()
+    twin.close()
