@@ -89,8 +89,8 @@ class ClipBank:
         """Frames of all clips as start states, each with the labels of its clip.
 
         ``context`` names labels besides those of the clips' tasks; a clip without one has NaN
-        there, which a task reads as "draw your own". A clip with an event ``start`` says when its
-        episode began, and its frames how long ago that was. Frames that reach more than ``floor`` (m)
+        there, which a task reads as "draw your own". Where a clip has an event ``start``, its
+        frames carry how long ago that was (``ELAPSED``). Frames that reach more than ``floor`` (m)
         below the ground are left out; a loaded foot sinks up to 1 cm at a take-off. Raises
         ValueError when no frame is left, a label is not a number or the clips differ in objects.
         """
@@ -111,18 +111,10 @@ class ClipBank:
             rows = rows[lowest(body, clip.qpos[rows]) >= -floor] if rows.size else rows
             qpos.append(clip.qpos[rows])
             qvel.append(clip.qvel[rows])
-            labels.append(
-                np.column_stack(
-                    [
-                        elapsed(clip)[rows]
-                        if name == ELAPSED
-                        else np.full(len(rows), label(clip, name))
-                        for name in names
-                    ]
-                )
-                if names
-                else np.zeros((len(rows), 0))
-            )
+            shared = np.tile([label(clip, name) for name in names], (len(rows), 1))
+            if ELAPSED in names:
+                shared[:, names.index(ELAPSED)] = elapsed(clip)[rows]
+            labels.append(shared)
             if clip.object_qpos is not None and clip.object_qvel is not None:
                 things.append(np.hstack([clip.object_qpos[rows], clip.object_qvel[rows]]))
             else:

@@ -12,19 +12,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
-from sports.env import make_env, make_scene
+from sports.env import Env, make_scene
 from sports.free_throw import LOWEST, RIM
 from sports.hoop import RING_RADIUS
 from sports.physics.base import GRAVITY
 from warmstart import thrown
 from warmstart.clip import Clip
+from warmstart.cross_entropy import CrossEntropy
 from warmstart.held_ball import fingers
+from warmstart.performance import perform
 from warmstart.solution import Solution
 from warmstart.tracking import _Worlds
 
@@ -41,8 +42,6 @@ UNITS = np.array([0.02, 0.02, 0.3, 0.03, *[0.12] * (len(BUMPS) * len(BUMPED)), 0
 (rad), and how far both shoulders turn to one side (rad)."""
 LATENCY = 0.02
 """How much later than the plan the targets start (s), besides the parameter."""
-RETURN = 0.7
-"""Time in which the targets go back to those of standing, after the plan (s)."""
 WATCHED = 0.14
 """How long after the release a candidate is judged by its flight (s)."""
 
@@ -151,34 +150,24 @@ def refine(
     """
     settings = settings or Search()
     thrower = _Thrower(solution, settings.worlds, threads)
-    rng = np.random.default_rng(settings.seed)
-    mean, spread = np.zeros(len(UNITS)), np.full(len(UNITS), 0.5)
-    best, least, miss, tried = mean, np.inf, np.inf, None
-    elites = max(4, settings.worlds // 6)
-    weight = np.log(elites + 0.5) - np.log(np.arange(1, elites + 1))
-    weight /= weight.sum()
+    search = CrossEntropy(len(UNITS), settings.worlds, settings.seed)
+    miss, tried = np.inf, None
     found: Refined | None = None
     done = 0
     for done in range(1, settings.rounds + 1):
-        drawn = mean + spread * rng.standard_normal((settings.worlds, len(UNITS)))
-        drawn[0], drawn[1] = best, mean
-        cost = thrower.judge(drawn)
-        order = np.argsort(cost, kind="stable")[:elites]
-        if cost[order[0]] < least:
-            best, least, miss = drawn[order[0]].copy(), cost[order[0]], thrower.miss[order[0]]
-        middle = weight @ drawn[order]
-        width = np.sqrt(weight @ (drawn[order] - middle) ** 2)
-        mean, spread = 0.2 * mean + 0.8 * middle, 0.3 * spread + 0.7 * width + 0.02
+        better = search.tell(thrower.judge(search.ask()))
+        if better is not None:
+            miss = thrower.miss[better]
         if progress is not None:
             progress(done, settings.rounds)
-        if miss <= settings.near and best is not tried:
-            tried = best
-            now = Refined(perform(solution, thrower, best), done)
+        if miss <= settings.near and search.best is not tried:
+            tried = search.best
+            now = Refined(throw(solution, thrower, search.best), done)
             if found is None or _rank(now) > _rank(found):
                 found = now
             if found.success and _off(found) <= settings.level:
                 return found
-    return found or Refined(perform(solution, thrower, best), done)
+    return found or Refined(throw(solution, thrower, search.best), done)
 
 
 def _off(found: Refined) -> float:
@@ -191,46 +180,19 @@ def _rank(found: Refined) -> tuple[bool, float]:
     return found.success, -_off(found)
 
 
-def perform(solution: Solution, thrower: _Thrower, numbers: np.ndarray) -> Clip:
+def throw(solution: Solution, thrower: _Thrower, numbers: np.ndarray) -> Clip:
     """The throw of the parameters (P,), played in the task with the ball until it ends."""
     strength = solution.body.strength
-    env = make_env(TASK, num_worlds=1, strength=strength, training=False)
-    env.keep_snapshot = True
-    scene, body = env.physics.scene, env.physics.scene.body
-    rate = 1.0 / scene.control_timestep
-    ctrl = thrower.targets(numbers, math.ceil(solution.duration * rate))
-    offset, scale = scene.action_offset(), body.action_scale()
-    first = env.snapshot()
-    qpos, qvel = [first["qpos"][0]], [first["qvel"][0]]
-    played, metrics, release = [], {}, None
-    for step in range(env.max_steps):
-        back = min(max(step - len(ctrl) + 1, 0) / (RETURN * rate), 1.0)
-        target = ctrl[min(step, len(ctrl) - 1)]
-        target = target + back * (offset - target)
-        action = torch.tensor((target - offset) / scale, dtype=torch.float32)
-        result = env.step(action[None, None])
-        if not bool(result.valid[0]):
-            raise RuntimeError(f"the throw diverged at control step {step}")
-        played.append(target)
-        metrics = {name: float(value[0]) for name, value in result.metrics.items()}
-        qpos.append(env.final_snapshot["qpos"][0].clone())
-        qvel.append(env.final_snapshot["qvel"][0].clone())
-        if release is None and math.isfinite(metrics["release_speed"]):
-            release = step - 2  # thrown after two free steps: this frame is still in the hands
-        if bool(result.terminated[0] | result.truncated[0]):
-            break
-    env.close()
-    played.append(played[-1])
-    places, rates = torch.stack(qpos).double().numpy(), torch.stack(qvel).double().numpy()
-    q, v = scene.agent_qpos(0), scene.agent_qvel(0)
-    ball, moving = scene.object_qpos("ball"), scene.object_qvel("ball")
-    achieved = {name: value for name, value in metrics.items() if math.isfinite(value)}
-    events = {}
-    if release is not None:
-        events["release"] = max(release, 0) / rate
-        free = max(release, 0) + 2
-        flight = thrown.fall(places[free, ball][:3], rates[free, moving][:3], np.array(RIM))
-        achieved["apex"] = flight["apex"]
+    steps = math.ceil(solution.duration / thrower.scene.control_timestep)
+    played = perform(TASK, strength, "ball", thrower.targets(numbers, steps), _thrown)
+    clip, achieved, events = played.clip, dict(played.metrics), {}
+    if True in played.seen:
+        # Thrown after two free steps: the frame before them is still in the hands.
+        release = max(played.seen.index(True) - 2, 0)
+        events["release"] = release / clip.fps
+        assert clip.object_qpos is not None and clip.object_qvel is not None
+        place, velocity = clip.object_qpos[release + 2, :3], clip.object_qvel[release + 2, :3]
+        achieved["apex"] = thrown.fall(place, velocity, np.array(RIM))["apex"]
     meta: dict[str, Any] = {
         "problem": TASK,
         "asked": dict(solution.asked),
@@ -241,13 +203,8 @@ def perform(solution: Solution, thrower: _Thrower, numbers: np.ndarray) -> Clip:
         "licence": "Apache-2.0",
         "events": events,
     }
-    return Clip(
-        fps=rate,
-        body=body.name,
-        qpos=places[:, q],
-        qvel=rates[:, v],
-        ctrl=np.array(played),
-        meta=meta,
-        object_qpos=places[:, ball],
-        object_qvel=rates[:, moving],
-    )
+    return replace(clip, meta=meta)
+
+
+def _thrown(env: Env) -> bool:
+    return bool(env.memory["thrown"][0])
