@@ -165,6 +165,13 @@ def demonstration_files(problem: str | None = None) -> list[Path]:
     return [f for f in files if problem is None or f.name.startswith(f"{problem}_")]
 
 
+def thrown_files(task: str) -> list[Path]:
+    """The shipped throws of a task that were searched in MuJoCo and have no plan, one for each
+    strength: ``warmstart/data/throws/TASK_STRENGTH.npz``."""
+    folder = Path(str(resources.files("warmstart").joinpath(DATA, "throws")))
+    return sorted(folder.glob(f"{task}_*.npz"))
+
+
 def load_demonstrations(problem: str, strength: str | None = None) -> list[Clip]:
     """Shipped demonstrations of a problem: certified, tracked in MuJoCo, labelled with what they
     achieved. ``strength`` keeps those of one strength.

@@ -70,6 +70,17 @@ def test_by_default_nothing_after_the_landing_serves_as_a_start():
     assert len(bank.starts(Window(before=None)).qpos) == 31
 
 
+def test_frames_of_an_episode_know_how_old_it_is():
+    """Also after a cut; a clip that is of no episode has NaN."""
+    played = clip(frames=11, events={"start": 0.0, "release": 0.2})
+    bank = ClipBank([played, clip(2.0, 4), played.cut(0.1, 0.3)])
+    ages = bank.starts().context["elapsed"].numpy()
+    cut = np.arange(3, 10) / 30
+    expected = np.concatenate([np.arange(11) / 30, np.full(4, np.nan), cut])
+    np.testing.assert_allclose(ages, expected, atol=1e-6)
+    assert not ClipBank([clip()]).starts().context
+
+
 def test_what_makes_no_bank_is_refused():
     with pytest.raises(ValueError, match="at least one clip"):
         ClipBank([])
