@@ -261,9 +261,7 @@ class Env:
         if self.training:
             add_noise(state, scene, self.generator)
         labels = self.starts.draw(state, scene, self.generator) if self.starts else {}
-        state, context = self.task.start(
-            self.view, state, labels, self.generator, self.training
-        )
+        state, context = self.task.start(self.view, state, labels, self.generator, self.training)
         if ELAPSED in labels:
             context = context | {ELAPSED: labels[ELAPSED]}
         return state, context
