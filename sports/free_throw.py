@@ -95,19 +95,21 @@ def begin(view: View, context: Memory) -> Memory:
     ball = view.physics.object_pos[:, 0]
     zero = torch.zeros_like(ball[:, 0])
     nothing = torch.full_like(zero, torch.nan)
-    return {
+    memory = {
         "ball": ball.clone(),
         "free_steps": zero.clone(),
         "thrown": zero > 0,
         "aim": zero.clone(),
         "toward": zero.clone(),
-        "entry": zero.clone(),
         "release_speed": nothing.clone(),
         "release_height": nothing.clone(),
         "miss": nothing.clone(),
         "entry_angle": nothing.clone(),
         "still_steps": zero.clone(),
     }
+    if view.config.entry > 0.0:
+        memory["entry"] = zero.clone()
+    return memory
 
 
 def features(view: View, memory: Memory) -> dict[str, Tensor]:
@@ -158,7 +160,10 @@ def advance(view: View, memory: Memory) -> Advance:
 
     aimed = at_release("aim", 0.5 * aim(ball, velocity, rim))
     toward = at_release("toward", 0.5 * ball_games.toward(ball, velocity, rim))
-    entry = at_release("entry", torch.exp(-4.0 * arrival(ball, velocity, rim).square()))
+    shaping: Memory = {}
+    if view.config.entry > 0.0:
+        there = torch.exp(-4.0 * arrival(ball, velocity, rim).square())
+        shaping["entry"] = at_release("entry", there)
 
     cross = crossing(memory["ball"], ball, rim, view.control_timestep)
     rises_through = cross.up & cross.inside
@@ -177,18 +182,18 @@ def advance(view: View, memory: Memory) -> Advance:
         "thrown": thrown,
         "aim": aimed,
         "toward": toward,
-        "entry": entry,
         "release_speed": at_release("release_speed", length(velocity)),
         "release_height": at_release("release_height", ball[:, 2]),
         "miss": torch.where(first_pass, cross.miss, memory["miss"]),
         "entry_angle": torch.where(first_pass, cross.angle, memory["entry_angle"]),
         "still_steps": still_steps,
+        **shaping,
     }
     released = torch.stack((memory["release_speed"], memory["release_height"]))
     speed, height = nan_where(~thrown, released).unbind()
     terms = {"aim": aimed, "toward": toward, "basket": success.float()}
     if view.config.entry > 0.0:
-        terms["entry"] = view.config.entry * entry
+        terms["entry"] = view.config.entry * shaping["entry"]
     return Advance(
         memory=memory,
         terms={name: term[:, None] for name, term in terms.items()},

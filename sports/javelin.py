@@ -98,16 +98,18 @@ def begin(view: View, context: Memory) -> Memory:
     ends, speeds = _ends(view)
     zero = torch.zeros_like(ends[:, 0, 0])
     start = constant(view.physics.scene.start_qpos[:3], zero.device)
-    return {
+    memory = {
         "start": start.expand(len(zero), 3).clone(),
         "x": view.physics.object_pos[:, 0, 0].clone(),
         "ends": ends,
         "speeds": speeds,
-        "opening": _opening(view, _nose(ends)),
         "fall": _fall(view, _nose(ends)),
         "released": zero > 0,
         "release_speed": torch.full_like(zero, torch.nan),
     }
+    if view.config.let_go > 0.0:
+        memory["opening"] = _opening(view, _nose(ends))
+    return memory
 
 
 def features(view: View, memory: Memory) -> dict[str, Tensor]:
@@ -159,9 +161,11 @@ def advance(view: View, memory: Memory) -> Advance:
     names = ("grab", "start", "goal", "attitude")
     stage = (clock >= HOLD_STEPS).long() + late
     terms: dict[str, Tensor] = dict(zip(names, (weights[stage] * shares).unbind(-1)))
-    opening = torch.maximum(memory["opening"], _opening(view, nose))
+    shaping: Memory = {}
     if view.config.let_go > 0.0:
+        opening = torch.maximum(memory["opening"], _opening(view, nose))
         terms["let_go"] = view.config.let_go * (opening - memory["opening"]).masked_fill(held, 0.0)
+        shaping["opening"] = opening
 
     # The hand leaves the shaft.
     touched, landed = (physics.pair_force > 0).unbind(-1)
@@ -193,10 +197,10 @@ def advance(view: View, memory: Memory) -> Advance:
         "x": x.clone(),
         "ends": ends,
         "speeds": speeds,
-        "opening": opening,
         "fall": _fall(view, nose),
         "released": released,
         "release_speed": nan_where(~released, speed),
+        **shaping,
     }
     return Advance(
         memory=memory,

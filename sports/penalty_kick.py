@@ -97,15 +97,17 @@ def begin(view: View, context: Memory) -> Memory:
     """Memory after a reset: the ball lies on the spot."""
     ball = view.physics.object_pos[:, 0]
     zero = torch.zeros_like(ball[:, 0])
-    return {
+    memory = {
         "target": context["target"],
         "ball": ball.clone(),
         "to_ball": length(view.root_pos[:, 0] - ball),
-        "nearest": foot_distance(view),
         "touched": zero.bool(),
         "since_touch": zero.clone(),
         "rest": zero.clone(),
     }
+    if view.config.reach > 0.0:
+        memory["nearest"] = foot_distance(view)
+    return memory
 
 
 def features(view: View, memory: Memory) -> dict[str, Tensor]:
@@ -159,8 +161,6 @@ def advance(view: View, memory: Memory) -> Advance:
     past = (root_x - SPOT[0]).clamp(min=0.0)
     # A touch against the rules pays nothing for where the ball goes.
     closer = closer & ~handling & ~squeezed
-    nearest = torch.minimum(memory["nearest"], foot_distance(view))
-    nearest = torch.where(memory["touched"], memory["nearest"], nearest)
     terms = {
         "approach": (0.4 * (memory["to_ball"] - to_ball)).masked_fill(closer, 0.0),
         "progress": 0.1 * gain * closer,
@@ -168,17 +168,21 @@ def advance(view: View, memory: Memory) -> Advance:
         "aim": 0.8 * near * closer,
         "line": torch.exp(-0.2 * past.square()) - 1.0,
     }
+    shaping: Memory = {}
     if view.config.reach > 0.0:
+        nearest = torch.minimum(memory["nearest"], foot_distance(view))
+        nearest = torch.where(memory["touched"], memory["nearest"], nearest)
         terms["reach"] = view.config.reach * (memory["nearest"] - nearest)
+        shaping["nearest"] = nearest
     return Advance(
         memory={
             "target": target,
             "ball": ball.clone(),
             "to_ball": to_ball,
-            "nearest": nearest,
             "touched": touched,
             "since_touch": since_touch,
             "rest": rest,
+            **shaping,
         },
         terms={name: term[:, None] for name, term in terms.items()},
         terminated=(failed | net)[:, None],

@@ -37,10 +37,8 @@ class Stroke:
     """By how much that is more than ever since the last stroke or launch."""
     promising: Tensor
     """bool: its stroke will land in the court beyond the net, and has not yet."""
-    to_target: Tensor
-    """(N, A, 3) from the target to the predicted landing (m)."""
     miss: Tensor
-    """Its square on the ground (m^2)."""
+    """Squared, from the predicted landing to the target (m^2)."""
     landed: Tensor
     """bool: its stroke has landed there in this step."""
     returns: Tensor
@@ -75,7 +73,6 @@ def judge(game: Game, view: View, memory: Memory, sharpness: float) -> Stroke:
         near=near,
         closer=(near - memory["nearest"]).clamp(min=0.0),
         promising=own & coming[:, None],
-        to_target=to_target,
         miss=to_target[..., 0].square() + to_target[..., 1].square(),
         landed=landed & has_struck,
         returns=memory["returns"],
@@ -97,8 +94,7 @@ def carried(view: View, memory: Memory, stroke: Stroke) -> Tensor:
     target that the ball will fly; 0 in other steps and for a stroke away from it."""
     ball = view.physics.object_pos[:, 0, None]
     way = (memory["target"] - ball)[..., :2]
-    left = torch.hypot(stroke.to_target[..., 0], stroke.to_target[..., 1])
-    share = 1.0 - left / torch.hypot(way[..., 0], way[..., 1]).clamp(min=1e-6)
+    share = 1.0 - stroke.miss.sqrt() / torch.hypot(way[..., 0], way[..., 1]).clamp(min=1e-6)
     point, agents = stroke.point, share.shape[1]
     flies = point.struck & ~point.bounced[:, None] & ~point.lost[:, :agents]
     return share.clamp(min=0.0) * flies

@@ -36,7 +36,7 @@ from warmstart.bank import START
 from warmstart.clip import Clip
 from warmstart.cross_entropy import CrossEntropy
 from warmstart.performance import perform
-from warmstart.tracking import _Worlds
+from warmstart.tracking import Worlds
 
 TASK = "javelin"
 BACK, AHEAD, END = -0.95, 0.2, 0.0
@@ -184,7 +184,7 @@ class Thrower:
 
     def __init__(self, strength: Strength, worlds: int, threads: int = 0) -> None:
         self.scene = make_scene(TASK, strength=strength)
-        self.worlds = _Worlds(self.scene, worlds, threads)
+        self.worlds = Worlds(self.scene, worlds, threads)
         body = self.scene.body
         self.line, self.rig = _Line(self.scene), _Rig(self.scene)
         self.kp = body.array("kp")

@@ -27,7 +27,7 @@ from warmstart.cross_entropy import CrossEntropy
 from warmstart.held_ball import fingers
 from warmstart.performance import perform
 from warmstart.solution import Solution
-from warmstart.tracking import _Worlds
+from warmstart.tracking import Worlds
 
 TASK = "free_throw"
 BUMPED = ("Shoulder_x", "Shoulder_y", "Shoulder_z", "Elbow_z", "Wrist_x", "Wrist_z")
@@ -80,7 +80,7 @@ class _Thrower:
 
     def __init__(self, solution: Solution, worlds: int, threads: int) -> None:
         self.solution, self.scene = solution, make_scene(TASK, strength=solution.body.strength)
-        self.worlds = _Worlds(self.scene, worlds, threads)
+        self.worlds = Worlds(self.scene, worlds, threads)
         self.release = float(solution.stats["event"]["time"])
         self.steps = math.ceil((self.release + WATCHED) / self.scene.control_timestep)
         body = self.scene.body

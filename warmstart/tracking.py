@@ -89,7 +89,7 @@ class Tracked:
         return self.clip.meta.get("achieved", {}).get("success") == 1.0
 
 
-class _Worlds:
+class Worlds:
     """A batch that plays candidates from one state, by the physics of the ``mujoco`` engine.
 
     Like the engine it keeps the athlete's momentum; unlike it, it simulates as many worlds as
@@ -176,7 +176,7 @@ def track(
     if scene.body.name != clip.body:
         raise ValueError(f"the clip is of body '{clip.body}', the scene of '{scene.body.name}'")
     begin = time.perf_counter()
-    worlds = _Worlds(scene, settings.worlds, threads)
+    worlds = Worlds(scene, settings.worlds, threads)
     frames = _reference(clip, worlds)
     steps, rules = len(frames.ctrl) - 1, None
     outcome = OUTCOMES.get(clip.meta.get("problem", ""))
@@ -278,7 +278,7 @@ def _rank(tracked: Tracked) -> tuple[bool, float, bool, float]:
     return tracked.success, _share(tracked), _clear(tracked), -tracked.link_error
 
 
-def _reference(clip: Clip, worlds: _Worlds) -> Reference:
+def _reference(clip: Clip, worlds: Worlds) -> Reference:
     scene = worlds.scene
     rate = 1.0 / scene.control_timestep
     if abs(clip.fps - rate) > 1e-6:
@@ -300,7 +300,7 @@ def _spline(knots: np.ndarray, steps: int, every: int) -> np.ndarray:
 def _follow(
     frames: Reference,
     end: int,
-    worlds: _Worlds,
+    worlds: Worlds,
     settings: Tracking,
     rules: JumpRules | None,
     progress: Callable[[int, int], None] | None,
@@ -363,7 +363,7 @@ def _follow(
 def _rollout(
     frames: Reference,
     end: int,
-    worlds: _Worlds,
+    worlds: Worlds,
     targets: np.ndarray,
     now: int,
     state: _State,

@@ -13,7 +13,7 @@ from sports.physics import PhysicsState, make_physics
 from sports.scene import humanoid_scene
 from warmstart.clip import Clip
 from warmstart.replay import play, scene_of
-from warmstart.tracking import Tracking, _Worlds, track
+from warmstart.tracking import Tracking, Worlds, track
 
 BODY = load_body("smpl", strength="human")
 LIGHT = Tracking(worlds=24, horizon=8, knot_every=2, iterations=2, noise=0.2)
@@ -87,7 +87,7 @@ def test_every_frame_follows_from_the_one_before_in_the_engine(tracked):
 def test_a_flight_in_the_worlds_has_one_ballistic_path():
     """Thrown up and flailing: the momentum that tracking reads is that of a thrown stone."""
     scene = humanoid_scene(BODY)
-    worlds = _Worlds(scene, 2, threads=1)
+    worlds = Worlds(scene, 2, threads=1)
     qpos, qvel = scene.default_qpos(), np.zeros(scene.nv)
     qpos[2], qvel[0], qvel[2] = 3.0, 2.0, 2.0
     start = worlds.kinematics(qpos[None], qvel[None])[2][0]
