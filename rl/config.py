@@ -76,6 +76,9 @@ class TrainConfig:
     """Part of the run in which the imitation reward lasts."""
     imitation_sharpness: float = 10.0
     """The imitation reward falls with exp(-this x squared joint difference in rad^2)."""
+    clone: int = 0
+    """Iterations at the beginning in which the actor learns the targets of the one clip in
+    ``clips``, a whole episode of the task (``rl/cloning.py``)."""
     impact: float = 0.0
     """Cost per step of each body weight by which the ground's force on a link exceeds
     ``impact_limit``: keeps motion off the hard impacts in which engines differ."""
@@ -110,6 +113,10 @@ class TrainConfig:
             raise ValueError("impact and impact_limit must not be negative")
         if not all(0.0 <= p <= 1.0 for p in self.start_probability):
             raise ValueError(f"start_probability must lie in [0, 1], not {self.start_probability}")
+        if self.clone < 0:
+            raise ValueError(f"clone must not be negative: {self.clone}")
+        if self.clone and len(self.clips) != 1:
+            raise ValueError("cloning needs one clip of a whole episode: give it with --clips")
         if self.algo != "amp" and self.amp != AMPConfig():
             raise ValueError("the --amp options need --algo amp")
         if self.algo == "amp" and self.task == TRACKING:

@@ -200,7 +200,8 @@ class PPO:
 
     # -- acting ---------------------------------------------------------------------------------
 
-    def _autocast(self) -> torch.autocast:
+    def autocast(self) -> torch.autocast:
+        """How the networks multiply: in bf16 where that was asked for."""
         # Without the cache: casts made inside a captured graph must not outlive it.
         return torch.autocast(
             self.device.type,
@@ -218,7 +219,7 @@ class PPO:
         """obs (M, D) raw -> stored obs (M, D), action (M, U), mean (M, U), log-prob (M,)."""
         self.obs_norm.collect(torch.nan_to_num(obs))
         stored = self.prepare(obs)
-        with self._autocast():
+        with self.autocast():
             mean = self.actor(stored)
         noise = torch.randn(mean.shape, device=self.device, generator=self.generator)
         action = mean + self.sigma * noise
@@ -227,7 +228,7 @@ class PPO:
     @torch.no_grad()
     def value(self, stored: Tensor) -> Tensor:
         """(..., D) stored observations -> (...) discounted return expected (scaled reward)."""
-        with self._autocast():
+        with self.autocast():
             return self.value_norm.denormalize(self.critic(stored)).squeeze(-1)
 
     # -- learning -------------------------------------------------------------------------------
@@ -302,7 +303,7 @@ class PPO:
         """One gradient step of actor and critic on the samples ``rows`` (m,) of the batch."""
         c, b = self.config, {name: x[rows] for name, x in self._batch.items()}
         weight = b["weight"]
-        with self._autocast():
+        with self.autocast():
             mean = self.actor(b["obs"])
             value = self.critic(b["obs"]).squeeze(-1)
         ratio = (gaussian_log_prob(b["action"], mean, self.sigma) - b["log_prob"]).exp()

@@ -23,6 +23,8 @@ from torch import Tensor
 
 from rl import amp, provenance
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
+from rl.cloning import STATISTIC as CLONE_ERROR
+from rl.cloning import Cloning
 from rl.config import (
     DEFAULT_SAMPLES,
     TRACKING,
@@ -45,6 +47,7 @@ from rl.rollout import collect
 from rl.runlog import Row, RunLog
 from sports.env import Starts
 from warmstart.atomic import write_text
+from warmstart.clip import Clip
 
 __all__ = ["RunSummary", "TrainConfig", "load_starts", "main", "parse_args", "train"]
 
@@ -152,6 +155,9 @@ class _Trainer:
             self.style = amp.of_athletes(
                 self.env, config.clips, self.hyper.steps, config.amp, device, *how
             )
+        self.cloning: Cloning | None = None
+        if config.clone > 0:
+            self.cloning = Cloning(self.env, self.agent, Clip.load(config.clips[0]), config.clone)
         self.samples_each = self.hyper.steps * rows * self.ranks
         self.iteration, self.samples, self.minutes = 0, 0, 0.0
         self.metrics: dict[str, float] = {}
@@ -235,12 +241,13 @@ class _Trainer:
     def _iterate(self, began: float, stop_samples: int | None) -> Row:
         """One rollout and its update. Waits for the device once, for the numbers of the row."""
         self._schedule(self._share(stop_samples))
+        cloning = self.cloning if self.iteration < self.config.clone else None
         clock = Stopwatch(self.device)
         clock.mark()
         with one_torch_thread(self.env.device):
             self.obs = collect(
                 self.env,
-                self.agent,
+                cloning or self.agent,
                 self.rollout,
                 self.obs,
                 self.hyper.gamma,
@@ -256,6 +263,7 @@ class _Trainer:
         else:
             losses = self.agent.update(self.rollout)
             losses |= self.style.update() if self.style is not None else {}
+            losses |= cloning.update(self.rollout, self.iteration) if cloning is not None else {}
         clock.mark()
         row: Row = {"iteration": self.iteration + 1}
         rates = {"learning_rate": self.agent.learning_rate, "sigma": self.agent.sigma}
@@ -294,6 +302,7 @@ class _Trainer:
             "update_s": update_s,
             **dict.fromkeys(STATISTICS),
             **dict.fromkeys(amp.STATISTICS if self.style is not None else ()),
+            **dict.fromkeys((CLONE_ERROR,) if self.cloning is not None else ()),
             **losses_now,
             **summary,
         }
@@ -314,7 +323,8 @@ class _Trainer:
         c, h = self.config, self.hyper
         if h.sigma_final is not None:
             self.agent.sigma.fill_(h.sigma * (h.sigma_final / h.sigma) ** share)
-        self.agent.actor_weight.fill_(0.0 if self.iteration < self.warmup else 1.0)
+        resting = self.iteration < max(self.warmup, c.clone)  # only the critic learns by reward
+        self.agent.actor_weight.fill_(0.0 if resting else 1.0)
         schedule = getattr(self.env, "schedule", None)
         if schedule is not None:  # an environment with a curriculum over the whole run
             schedule(share)
@@ -383,6 +393,8 @@ class _Trainer:
         tensors |= {f"meter/{k}": v for k, v in self.meter.state_dict().items()}
         if self.style is not None:
             tensors |= {f"style/{k}": v for k, v in self.style.state_dict().items()}
+        if self.cloning is not None:
+            tensors |= {f"cloning/{k}": v for k, v in self.cloning.state_dict().items()}
         tensors["obs"] = self.obs
         barrier = dist.barrier if self.ranks > 1 else None
         return save_checkpoint(self.config.out, self.iteration, state, tensors, self.rank, barrier)
@@ -405,6 +417,8 @@ class _Trainer:
         self.meter.load_state_dict(part("meter/"))
         if self.style is not None:
             self.style.load_state_dict(part("style/"))
+        if self.cloning is not None:
+            self.cloning.load_state_dict(part("cloning/"))
         self.iteration, self.samples = state["iteration"], state["samples"]
         self.minutes, self.warmup = state["minutes"], state["warmup"]
         self.metrics = state["card"]["metrics"]

@@ -1,0 +1,141 @@
+"""Behavioural cloning of one demonstration before reinforcement learning begins.
+
+A throw is a second of exact timing: an actor of random weights drops the ball, and nothing that it
+earns says how to throw. A demonstration of a whole episode has the targets of every control step,
+and PD targets are a feedback themselves: played open loop they throw from a start that is a little
+different, too. So for the first iterations of a run half of the worlds play the demonstration's
+targets with the policy's noise, half play the actor (DAgger, Ross et al. 2011: the states that it
+gets itself into), and all are labelled with the targets of their step. The actor learns the labels,
+the critic learns from the task's rewards as ever.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from rl.ppo import PPO, gaussian_log_prob
+from rl.rollout import Rollout
+from warmstart.bank import START, elapsed
+from warmstart.clip import Clip
+
+RATES = (1e-3, 1e-4)
+"""Learning rates at the beginning and the end of the cloning, geometric between."""
+LED = 0.5
+"""Share of the worlds in which the demonstration is played."""
+STATISTIC = "clone_error"
+"""Root mean square difference of the actor's actions from the demonstration's (action units)."""
+
+
+def reference(clip: Clip, env: Any) -> Tensor:
+    """(T, act) actions of an environment that play a clip's targets, by step of the episode.
+
+    Raises ValueError for a clip without targets, of another body or rate, or that does not say
+    when its episode began.
+    """
+    body = env.physics.scene.body
+    if clip.body != body.name:
+        raise ValueError(f"the clip to clone is of body '{clip.body}', the task's is '{body.name}'")
+    if clip.ctrl is None or START not in clip.meta.get("events", {}):
+        raise ValueError(
+            "a clip to clone must have targets (ctrl) and the event 'start': it is a whole episode "
+            "of the task, like those in warmstart/data/throws"
+        )
+    if abs(clip.fps * env.physics.scene.control_timestep - 1.0) > 1e-6:
+        raise ValueError(
+            f"the clip to clone has {clip.fps:g} frames a second: it must have one a control step"
+        )
+    first = round(float(-elapsed(clip)[0]) * clip.fps)
+    if not 0 <= first < clip.num_frames:
+        raise ValueError("the episode of the clip to clone begins outside of the clip")
+    targets = torch.tensor(np.asarray(clip.ctrl[first:]), dtype=torch.float32, device=env.device)
+    return ((targets - env.action_offset) / env.action_scale).clamp(-1.0, 1.0)
+
+
+class Cloning:
+    """An actor (see ``rl.rollout.Actor``) that plays and labels; ``update`` learns the labels."""
+
+    def __init__(self, env: Any, agent: PPO, clip: Clip, iterations: int) -> None:
+        """Args:
+        env: of one athlete a world.
+        agent: whose actor learns.
+        clip: a whole episode from the task's own start; see :func:`reference`.
+        iterations: how long, for the learning rate.
+        """
+        if env.num_agents != 1:
+            raise ValueError("cloning is for tasks of one athlete")
+        self.env, self.agent, self.iterations = env, agent, iterations
+        self.device = agent.device
+        self.actions = reference(clip, env).to(self.device)
+        self.led = torch.arange(env.num_worlds, device=self.device) < LED * env.num_worlds
+        self.optimizer = torch.optim.Adam(agent.actor.parameters(), lr=RATES[0])
+
+    def labels(self) -> Tensor:
+        """(N, act) the demonstration's actions at the worlds' control steps; after its end the
+        last ones."""
+        step = self.env.view.clock.to(self.device).clamp(max=len(self.actions) - 1)
+        return self.actions[step]
+
+    def prepare(self, obs: Tensor) -> Tensor:
+        """(M, D) raw observations -> as stored."""
+        return self.agent.prepare(obs)
+
+    @torch.no_grad()
+    def act(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """obs (M, D) raw -> stored obs, action, label (in the mean's place), log-prob of the action
+        by the actor: the critic's update, which comes first, then finds ratios of 1."""
+        stored, action, mean, _ = self.agent.act(obs)
+        label, noise = self.labels(), action - mean
+        action = torch.where(self.led[:, None], label, mean) + noise
+        return stored, action, label, gaussian_log_prob(action, mean, self.agent.sigma)
+
+    def update(self, rollout: Rollout, done: int) -> dict[str, Tensor]:
+        """Learns the labels of a rollout; ``done`` iterations of cloning were before. Returns the
+        error before it learned from them."""
+        c, share = self.agent.config, done / max(self.iterations, 1)
+        for group in self.optimizer.param_groups:
+            group["lr"] = RATES[0] * (RATES[1] / RATES[0]) ** share
+        obs, label = rollout.obs.flatten(0, 1), rollout.mean.flatten(0, 1)
+        weight = rollout.valid.flatten().float()
+        error, size = torch.zeros((), device=self.device), len(obs)
+        for epoch in range(c.epochs):
+            order = torch.randperm(size, device=self.device, generator=self.agent.generator)
+            for rows in order.split(size // c.minibatches)[: c.minibatches]:
+                with self.agent.autocast():
+                    mean = self.agent.actor(obs[rows])
+                squared = (weight[rows, None] * (mean - label[rows]).square()).mean()
+                self.optimizer.zero_grad(set_to_none=True)
+                (squared / self.agent.sigma.square()).backward()
+                if dist.is_initialized():
+                    grads = [p.grad for p in self.agent.actor.parameters() if p.grad is not None]
+                    for grad in grads:
+                        dist.all_reduce(grad)
+                        grad /= self.agent.world_size
+                torch.nn.utils.clip_grad_norm_(self.agent.actor.parameters(), c.grad_norm)
+                self.optimizer.step()
+                if epoch == 0:
+                    error += squared.detach() / c.minibatches
+        return {STATISTIC: error.sqrt()}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Moments of the optimiser, by parameter."""
+        state = {}
+        for name, p in self.agent.actor.named_parameters():
+            for key, value in self.optimizer.state.get(p, {}).items():
+                state[f"{name}.{key}"] = value.clone()
+        return state
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Takes the moments back."""
+        for name, p in self.agent.actor.named_parameters():
+            keys = ("step", "exp_avg", "exp_avg_sq")
+            own = {k: state[f"{name}.{k}"].clone() for k in keys if f"{name}.{k}" in state}
+            if own:
+                own["exp_avg"], own["exp_avg_sq"] = (
+                    own[k].to(self.device) for k in ("exp_avg", "exp_avg_sq")
+                )
+                self.optimizer.state[p] = own
