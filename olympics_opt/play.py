@@ -213,10 +213,11 @@ def run_train(args: list[str]) -> int:
     from rl.train import parse_args, train
 
     summary = train(parse_args(args, prog="olympics-opt train"))
-    print(
-        f"stopped by {summary.stopped_by} after {summary.samples:,} samples, "
-        f"{summary.minutes:.1f} minutes: {summary.checkpoint}"
-    )
+    if summary.rank == 0:
+        print(
+            f"stopped by {summary.stopped_by} after {summary.samples:,} samples, "
+            f"{summary.minutes:.1f} minutes: {summary.checkpoint}"
+        )
     return 0
 
 

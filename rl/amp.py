@@ -23,6 +23,7 @@ from rl.discriminator import Replay, discriminator_losses, style_reward
 from rl.graph import GraphedStep
 from rl.networks import MLP
 from rl.normalizer import Normalizer
+from rl.ranks import SharedGradients, SharedStep
 from rl.rollout import Rollout
 from rl.style_features import Athletes, Demonstrations, load_demonstrations
 
@@ -173,8 +174,13 @@ class AMP:
         )
         self._stats = torch.zeros(4, device=self.device)
         self._paid: tuple[Tensor, ...] = ()
-        wanted = cuda_graph and cuda and self.world_size == 1
-        self._train = GraphedStep(self._minibatch, self.optimizer.zero_grad, wanted)
+        wanted = cuda_graph and cuda
+        self._train: GraphedStep | SharedStep
+        if self.world_size == 1:
+            self._train = GraphedStep(self._minibatch, self.optimizer.zero_grad, wanted)
+        else:
+            shared = SharedGradients(self.net.parameters())
+            self._train = SharedStep(shared, self._backward, self._descend, wanted)
 
     # -- watching -------------------------------------------------------------------------------
 
@@ -267,6 +273,12 @@ class AMP:
 
     def _minibatch(self, picks: Tensor) -> None:
         """One gradient step on windows (3 B,): of the rollout, the replay, the demonstrations."""
+        self.optimizer.zero_grad(set_to_none=True)
+        self._backward(picks)
+        self._descend()
+
+    def _backward(self, picks: Tensor) -> None:
+        """Adds the gradients of windows (3 B,) and their statistics."""
         c = self.config
         now, past, begin = picks.view(3, -1)
         t, row = now // self.rows, now % self.rows
@@ -288,22 +300,13 @@ class AMP:
         )
         # Without a single window of the agent there is nothing to tell apart yet.
         loss = loss * (weight.sum() > 0.0)
-        self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        if self.world_size > 1:
-            self._average_over_ranks()
         with torch.no_grad():
             accuracies = (losses.accuracy_agent, losses.accuracy_demonstration)
             self._stats += torch.stack((entropy, losses.gradient, *accuracies))
-        self.optimizer.step()
 
-    def _average_over_ranks(self) -> None:
-        grads = [p.grad for p in self.net.parameters() if p.grad is not None]
-        flat = torch.cat([g.flatten() for g in grads])
-        dist.all_reduce(flat)
-        flat /= self.world_size
-        parts = flat.split([g.numel() for g in grads])
-        torch._foreach_copy_(grads, [p.view_as(g) for p, g in zip(parts, grads)])
+    def _descend(self) -> None:
+        self.optimizer.step()
 
     def _collect(self) -> None:
         """Statistics of features: as many frames of demonstrations as of the agent."""

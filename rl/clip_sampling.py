@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from torch import Tensor
 
 from rl.motion import MotionTables
@@ -70,6 +71,9 @@ class ClipSampling:
         """(K,) frames of each bin from which episodes start."""
         self.failure = torch.ones(len(first), dtype=torch.float64, device=device)
         """(K,) running failure rates; 1 before the first visit, so that all are tried."""
+        # For several ranks: the rates all had last, and this rank's failures and visits since.
+        self._agreed = self.failure.clone()
+        self._news = torch.zeros(2, len(first), dtype=torch.float64, device=device)
 
     def probabilities(self) -> Tensor:
         """(K,) chance of each bin, float64."""
@@ -98,6 +102,24 @@ class ClipSampling:
         zero = torch.zeros_like(self.failure)
         fails = zero.index_add(0, bins, failed.double())
         visits = zero.index_add(0, bins, (failed | passed).double())
+        self.failure.copy_(self._taken_in(self.failure, fails, visits))
+        if dist.is_initialized():
+            self._news += torch.stack((fails, visits))
+
+    def merge_ranks(self) -> None:
+        """Every rank takes in what happened on all of them since the last call, as one visit after
+        the other of their mean: then all have the same rates."""
+        dist.all_reduce(self._news)
+        self.restore(self._taken_in(self._agreed, *self._news))
+
+    def restore(self, failure: Tensor) -> None:
+        """Goes on from known failure rates (K,)."""
+        self.failure.copy_(failure)
+        self._agreed.copy_(failure)
+        self._news.zero_()
+
+    def _taken_in(self, failure: Tensor, fails: Tensor, visits: Tensor) -> Tensor:
+        """Rates (K,) after so many failures and visits (K,) of each bin."""
         mean = fails / visits.clamp(min=1.0)
         kept = torch.pow(1.0 - self.rate, visits)
-        self.failure.copy_(mean + kept * (self.failure - mean))
+        return mean + kept * (failure - mean)

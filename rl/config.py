@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import tyro
 
 from rl.amp import AMPConfig
 from rl.checkpoint import checkpoints, read_state
+from rl.host import local_ranks
 from rl.ppo import PAPER, PPOConfig
 from sports.env import Env, Starts, make_env
 from sports.physics.variation import Variation
@@ -38,9 +40,11 @@ class TrainConfig:
     engine: Literal["mujoco", "warp", "drake"] = "mujoco"
     """Physics engine: mujoco needs no GPU, warp needs one, drake is for checking, not training."""
     worlds: int | None = None
-    """Worlds per process; None for 256 on mujoco and 8192 on warp."""
+    """Worlds per process, which with torchrun is per GPU; None for 256 on mujoco and 8192 on
+    warp."""
     samples: int | None = None
-    """Stop after this many samples; None for 100 M where no minutes are given."""
+    """Stop after this many samples, of all processes together; None for 100 M where no minutes are
+    given."""
     minutes: float | None = None
     """Stop after this many minutes of training, earlier sessions of the run counted in."""
     seed: int = 0
@@ -142,6 +146,9 @@ MakeEnv = Callable[[TrainConfig, int], Any]
 def default_env(config: TrainConfig, seed: int) -> Env:
     """The config's task on its engine, in training mode."""
     physics_options = dict(config.physics_options)
+    if config.engine == "mujoco" and local_ranks() > 1:
+        each = max(1, (os.cpu_count() or 1) // local_ranks())
+        physics_options = {"threads": each} | physics_options
     if config.vary:
         physics_options |= {"variation": Variation(), "variation_seed": seed}
     if config.task == TRACKING:

@@ -70,16 +70,39 @@ class Stopwatch:
         return [b - a for a, b in pairs]
 
 
-def join_ranks() -> bool:
-    """Joins the process group that torchrun has prepared, if any; whether it did."""
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or dist.is_initialized():
+def join_ranks(device: str = "auto") -> bool:
+    """Joins the process group that torchrun has prepared, if any; whether it did.
+
+    With GPUs, each process takes the one of its local rank as the current device, and the ranks
+    talk through NCCL; with ``device`` ``cpu``, or none, through gloo. Raises ValueError where the
+    processes are more than the GPUs, or ``device`` names one for all.
+    """
+    ranks = int(os.environ.get("WORLD_SIZE", "1"))
+    if ranks == 1 or dist.is_initialized():
         return False
-    if torch.cuda.is_available():
-        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
-        dist.init_process_group("nccl")
-    else:
+    if device == "cpu" or not torch.cuda.is_available():
         dist.init_process_group("gloo")
+        return True
+    here, gpus = local_ranks(), torch.cuda.device_count()
+    if ":" in device:
+        raise ValueError(
+            f"--device {device} names one GPU for {ranks} processes: leave it out, and each takes "
+            "its own"
+        )
+    if here > gpus:
+        raise ValueError(
+            f"{here} processes need {here} GPUs, and this machine has {gpus}: give torchrun "
+            f"--nproc-per-node {gpus}, or train on the processor with --device cpu"
+        )
+    own = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+    torch.cuda.set_device(own)
+    dist.init_process_group("nccl", device_id=own)
     return True
+
+
+def local_ranks() -> int:
+    """Processes of this run on this machine."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 
 
 @contextmanager
@@ -100,7 +123,8 @@ def pick_device(name: str) -> torch.device:
     if name != "auto":
         if name.startswith("cuda") and not torch.cuda.is_available():
             raise ValueError("there is no CUDA device here: use --device cpu")
-        return torch.device(name)
+        if name != "cuda":
+            return torch.device(name)
     if torch.cuda.is_available():
         return torch.device("cuda", torch.cuda.current_device())
     return torch.device("cpu")

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from rl.graph import GraphedStep
 from rl.networks import MLP, Activation
 from rl.normalizer import Normalizer
+from rl.ranks import SharedGradients, SharedStep
 from rl.rollout import Rollout, generalized_advantages
 
 
@@ -183,8 +184,18 @@ class PPO:
         self.optimizer = torch.optim.Adam(groups, fused=True, capturable=cuda)
         self._stats = torch.zeros(5, device=self.device)
         self._batch: dict[str, Tensor] = {}
-        wanted = cuda_graph and cuda and self.world_size == 1
-        self._step = GraphedStep(self._minibatch, self.optimizer.zero_grad, wanted)
+        wanted = cuda_graph and cuda
+        self._step: GraphedStep | SharedStep
+        if self.world_size == 1:
+            self._step = GraphedStep(self._minibatch, self.optimizer.zero_grad, wanted)
+        else:
+            shared = SharedGradients(self._named_parameters().values(), self._stats.numel())
+            self._step = SharedStep(
+                shared,
+                lambda rows: shared.numbers.copy_(self._backward(rows)),
+                lambda: self._descend(shared.numbers),
+                wanted,
+            )
 
     def new_rollout(self, rows: int) -> Rollout:
         """Storage for ``rows`` = worlds x agents. Raises ValueError if too few for minibatches."""
@@ -301,6 +312,12 @@ class PPO:
 
     def _minibatch(self, rows: Tensor) -> None:
         """One gradient step of actor and critic on the samples ``rows`` (m,) of the batch."""
+        self.optimizer.zero_grad(set_to_none=True)
+        self._descend(self._backward(rows))
+
+    def _backward(self, rows: Tensor) -> Tensor:
+        """Adds the gradients of the samples ``rows`` (m,). Returns their statistics: (5,) kl,
+        clip_fraction, policy_loss, value_loss, bounds_loss."""
         c, b = self.config, {name: x[rows] for name, x in self._batch.items()}
         weight = b["weight"]
         with self.autocast():
@@ -315,32 +332,24 @@ class PPO:
             error = torch.maximum(error, (moved - b["target"]).square())
         value_loss = (weight * error).mean()
         actor_loss = policy_loss + c.bounds_coefficient * bounds_loss
-        self.optimizer.zero_grad(set_to_none=True)
         (self.actor_weight * actor_loss + c.critic_coefficient * value_loss).backward()
         with torch.no_grad():
             divergence = (mean - b["mean"]).square().sum(-1) / (2.0 * self.sigma.square())
             kl = (weight * divergence).mean()
             clipped = (weight * ((ratio - 1.0).abs() > c.clip_ratio)).mean()
-            stats = torch.stack((kl, clipped, policy_loss, value_loss, bounds_loss))
-            if self.world_size > 1:
-                self._average_over_ranks(stats)
-            adapted = adapted_rate(self.learning_rate, stats[0], c)
-            # A resting actor diverges from nothing: its rate must not climb meanwhile.
-            self.learning_rate.copy_(torch.lerp(self.learning_rate, adapted, self.actor_weight))
-            self._stats += stats
+            return torch.stack((kl, clipped, policy_loss, value_loss, bounds_loss))
+
+    @torch.no_grad()
+    def _descend(self, stats: Tensor) -> None:
+        """Steps along the gradients; ``stats`` (5,) of the samples decide the actor's rate."""
+        c = self.config
+        adapted = adapted_rate(self.learning_rate, stats[0], c)
+        # A resting actor diverges from nothing: its rate must not climb meanwhile.
+        self.learning_rate.copy_(torch.lerp(self.learning_rate, adapted, self.actor_weight))
+        self._stats += stats
         nn.utils.clip_grad_norm_(self.actor.parameters(), c.grad_norm, foreach=True)
         nn.utils.clip_grad_norm_(self.critic.parameters(), c.grad_norm, foreach=True)
         self.optimizer.step()
-
-    def _average_over_ranks(self, stats: Tensor) -> None:
-        """Gradients and statistics become their means over the ranks, in one message."""
-        grads = [p.grad for p in self._named_parameters().values() if p.grad is not None]
-        flat = torch.cat([stats, *(g.flatten() for g in grads)])
-        dist.all_reduce(flat)
-        flat /= self.world_size
-        parts = flat.split([stats.numel(), *(g.numel() for g in grads)])
-        stats.copy_(parts[0])
-        torch._foreach_copy_(grads, [p.view_as(g) for p, g in zip(parts[1:], grads)])
 
     # -- state ----------------------------------------------------------------------------------
 

@@ -321,6 +321,10 @@ class TrackingEnv(Env):
         """Sets the curriculum for the part of the run that is done."""
         self.tracking.schedule(share)
 
+    def merge_ranks(self) -> None:
+        """Several ranks learn from each other's failures; each calls this after a rollout."""
+        self.tracking.sampling.merge_ranks()
+
     def state_dict(self) -> dict[str, Tensor]:
         """As of Env, with failure rates, curriculum and the library's digest."""
         own = {
@@ -336,7 +340,7 @@ class TrackingEnv(Env):
         digest = state.get("tracking/library")
         if digest is None or bytes(digest.tolist()) != self._digest:
             raise ValueError("the run was trained on another clip library: resume it with that one")
-        self.tracking.sampling.failure.copy_(state["tracking/failure"])
+        self.tracking.sampling.restore(state["tracking/failure"])
         self.tracking.sharpness.copy_(state["tracking/sharpness"])
         self.tracking.tolerance.copy_(state["tracking/tolerance"])
         return super().load_state_dict(state)

@@ -22,7 +22,13 @@ import torch.distributed as dist
 from torch import Tensor
 
 from rl import amp, provenance
-from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
+from rl.checkpoint import (
+    CheckpointError,
+    checkpoints,
+    load_checkpoint,
+    read_state,
+    save_checkpoint,
+)
 from rl.cloning import STATISTIC as CLONE_ERROR
 from rl.cloning import Cloning
 from rl.config import (
@@ -43,6 +49,7 @@ from rl.meter import EpisodeMeter
 from rl.policy import FORMAT as POLICY_FORMAT
 from rl.policy import load_policy
 from rl.ppo import PPO, STATISTICS
+from rl.ranks import over_ranks
 from rl.rollout import collect
 from rl.runlog import Row, RunLog
 from sports.env import Starts
@@ -65,6 +72,8 @@ class RunSummary:
     metrics: dict[str, float]
     """Episode metrics of the last iteration in which an episode ended."""
     checkpoint: Path
+    rank: int = 0
+    """Of this process; rank 0 speaks for all."""
 
 
 def train(
@@ -88,13 +97,21 @@ def train(
     Raises ValueError for settings that cannot be, PolicyError for ``init``, CheckpointError when
     a checkpoint cannot be written or read, RuntimeError for an engine that cannot run here.
     """
-    began_group = join_ranks()
+    began_group = join_ranks(config.device)
     try:
         config = settle(config)
-        return _Trainer(config, starts, environment, on_iteration).run(part)
-    finally:
-        if began_group:
-            dist.destroy_process_group()
+        summary = _Trainer(config, starts, environment, on_iteration).run(part)
+    except ValueError:  # every rank has made the same mistake
+        _leave_ranks(began_group)
+        raise
+    _leave_ranks(began_group)
+    return summary
+
+
+def _leave_ranks(began: bool) -> None:
+    """Not after an error of one rank: the others would be waited for, and torchrun ends them."""
+    if began:
+        dist.destroy_process_group()
 
 
 class _Trainer:
@@ -193,6 +210,12 @@ class _Trainer:
             self._write_config()
             if self.resumed and not config.quiet:
                 print(f"{config.out} goes on after iteration {self.iteration}", flush=True)
+            if self.ranks > 1 and not config.quiet:
+                print(
+                    f"{self.ranks} processes with {self.env.num_worlds} worlds each: samples and "
+                    "samples_per_s are of all of them",
+                    flush=True,
+                )
         began = time.monotonic() - 60.0 * self.minutes
         last_saved, saved, stopped_by = self.minutes, None, ""
         try:
@@ -236,6 +259,7 @@ class _Trainer:
             stopped_by=stopped_by,
             metrics=self.metrics,
             checkpoint=saved,
+            rank=self.rank,
         )
 
     def _iterate(self, began: float, stop_samples: int | None) -> Row:
@@ -254,6 +278,9 @@ class _Trainer:
                 on_step=self._watch,
                 bonuses=self.bonuses,
             )
+        merge = getattr(self.env, "merge_ranks", None)
+        if self.ranks > 1 and merge is not None:  # what the environment learns from its episodes
+            merge()
         if self.style is not None:
             self.style.pay(self.rollout, self.env.reward_scale)
         clock.mark()
@@ -267,29 +294,34 @@ class _Trainer:
         clock.mark()
         row: Row = {"iteration": self.iteration + 1}
         rates = {"learning_rate": self.agent.learning_rate, "sigma": self.agent.sigma}
-        numbers = losses | rates
-        tail = torch.stack([x.double().to(self.device) for x in numbers.values()])
-        episode = self.meter.totals().to(self.device)
+        levels = {f"curriculum/{k}": x.float().mean() for k, x in self.env.curriculum.items()}
+        means = losses | rates | levels
+        physics = getattr(self.env, "physics", None)
+        counts = {k: getattr(physics, k, 0) for k in ("nan_worlds", "overflow")}
+        episode = self.meter.totals()
         # Rank 0's clock decides for all: the others add 0 seconds.
         seconds = time.monotonic() - began if self.rank == 0 else 0.0
-        head = torch.cat((episode, torch.tensor([seconds], dtype=torch.float64).to(self.device)))
-        if self.ranks > 1:
-            dist.all_reduce(head)
-        values = torch.cat((head, tail)).tolist()  # the one wait of the iteration
+        own = (*counts.values(), torch.tensor(seconds, dtype=torch.float64))
+        totals, averages = over_ranks(
+            torch.cat([episode.to(self.device), *(self._number(x) for x in own)]),
+            torch.cat([self._number(x) for x in means.values()]),
+        )  # the one wait of the iteration
         before = self.minutes
         # Seconds were read before the device had finished; the wait is over now.
         self.minutes = (time.monotonic() - began) / 60.0
         if self.ranks > 1:
-            self.minutes = values[len(episode)] / 60.0
+            self.minutes = totals[-1] / 60.0
         self.iteration += 1
         self.samples += self.samples_each
-        losses_now = dict(zip(numbers, values[len(episode) + 1 :]))
+        counts_now = {k: int(v) for k, v in zip(counts, totals[len(episode) :])}
+        means_now = dict(zip(means, averages))
+        losses_now = {k: means_now[k] for k in (*losses, *rates)}
         if not all(math.isfinite(v) for v in losses_now.values()):
             raise RuntimeError(
                 f"learning diverged at iteration {self.iteration} (a loss is not finite): go on "
                 "from the last checkpoint with --resume, or start with a smaller learning rate"
             )
-        summary = self.meter.summary(values[: len(episode)])
+        summary = self.meter.summary(totals)
         metrics = {k[8:]: v for k, v in summary.items() if k.startswith("metrics/")}
         self.metrics |= {k: v for k, v in metrics.items() if v is not None and math.isfinite(v)}
         took = max(60.0 * (self.minutes - before), 1e-9)
@@ -306,11 +338,11 @@ class _Trainer:
             **losses_now,
             **summary,
         }
-        physics = getattr(self.env, "physics", None)
-        row["nan_worlds"] = int(getattr(physics, "nan_worlds", 0))
-        row["overflow"] = int(getattr(physics, "overflow", 0))
-        levels = self.env.curriculum.items()
-        return row | {f"curriculum/{name}": float(x.float().mean()) for name, x in levels}
+        return row | counts_now | {k: means_now[k] for k in levels}
+
+    def _number(self, x: Tensor | int) -> Tensor:
+        """(1,) float64 on the learner's device."""
+        return torch.as_tensor(x).double().to(self.device)[None]
 
     def _share(self, stop_samples: int | None) -> float:
         """Part of the run that is done, 0..1: the schedules' clock."""
@@ -402,12 +434,8 @@ class _Trainer:
     def _restore(self) -> Tensor:
         """Takes the last checkpoint back; returns the observation to go on from."""
         path = checkpoints(self.config.out)[-1]
-        state, tensors = load_checkpoint(path, self.rank)
-        if state["ranks"] != self.ranks:
-            raise ValueError(
-                f"{path} was written by {state['ranks']} processes, this run has {self.ranks}: "
-                "resume with as many"
-            )
+        saved = int(read_state(path)["ranks"])
+        state, tensors = load_checkpoint(path, self.rank % saved)
 
         def part(prefix: str) -> dict[str, Tensor]:
             return {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
@@ -422,6 +450,12 @@ class _Trainer:
         self.iteration, self.samples = state["iteration"], state["samples"]
         self.minutes, self.warmup = state["minutes"], state["warmup"]
         self.metrics = state["card"]["metrics"]
+        if self.rank >= saved:  # the worlds of another rank, but not its future
+            part_of_run = 1_000_003 * self.rank + self.iteration
+            for k, owner in enumerate((self.agent, self.env, self.style)):
+                generator = getattr(owner, "generator", None)
+                if generator is not None:
+                    generator.manual_seed(self.config.seed + 7919 * k + part_of_run)
         return tensors["obs"].to(self.env.device)
 
 
@@ -430,9 +464,11 @@ def main(args: list[str] | None = None) -> int:
     try:
         summary = train(parse_args(sys.argv[1:] if args is None else args))
     except (ValueError, RuntimeError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        rank = os.environ.get("RANK", "0")
+        if rank == "0" or not isinstance(error, ValueError):  # a user's mistake is told once
+            print(f"error: {'' if rank == '0' else f'rank {rank}: '}{error}", file=sys.stderr)
         return 2
-    if os.environ.get("RANK", "0") == "0":
+    if summary.rank == 0:
         print(
             f"stopped by {summary.stopped_by} after {summary.samples} samples; last checkpoint "
             f"{summary.checkpoint}"
