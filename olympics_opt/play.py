@@ -214,10 +214,7 @@ def run_train(args: list[str]) -> int:
 
     summary = train(parse_args(args, prog="olympics-opt train"))
     if summary.rank == 0:
-        print(
-            f"stopped by {summary.stopped_by} after {summary.samples:,} samples, "
-            f"{summary.minutes:.1f} minutes: {summary.checkpoint}"
-        )
+        print(summary.sentence())
     return 0
 
 

@@ -107,6 +107,9 @@ class TrainConfig:
     """Replay the update as a CUDA graph where that is possible."""
     quiet: bool = False
     """Print nothing."""
+    profile: bool = False
+    """Measure a few updates instead of training: a table of where their time goes, and
+    ``trace.json.gz`` in the run's folder for chrome://tracing or ui.perfetto.dev."""
 
     def __post_init__(self) -> None:
         for name in ("worlds", "samples", "minutes", "checkpoint_iterations"):
@@ -209,7 +212,7 @@ def load_placed_starts(paths: tuple[Path, ...], probability: float) -> Starts | 
 
 
 FREE = {"out", "resume", "samples", "minutes", "quiet", "checkpoint_minutes"}
-FREE |= {"checkpoint_iterations", "device", "cuda_graph", "physics_options"}
+FREE |= {"checkpoint_iterations", "device", "cuda_graph", "physics_options", "profile"}
 """What a resumed run may change; everything else is the run's own."""
 
 

@@ -73,7 +73,8 @@ class SharedStep:
             shared.clear()
             gradients(rows)
 
-        self._shared = shared
+        self.shared = shared
+        """buffer of the gradients"""
         self._first = GraphedStep(first, shared.clear, wanted)
         self._second = GraphedStep(lambda _: descend(), lambda: None, wanted)
         self._nothing = torch.zeros(0, device=shared.numbers.device)
@@ -86,7 +87,7 @@ class SharedStep:
     def __call__(self, rows: Tensor) -> None:
         """Runs the step on ``rows`` (m,), always of the same size."""
         self._first(rows)
-        self._shared.average()
+        self.shared.average()
         self._second(self._nothing)
 
 

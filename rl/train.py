@@ -49,6 +49,7 @@ from rl.meter import EpisodeMeter
 from rl.policy import FORMAT as POLICY_FORMAT
 from rl.policy import load_policy
 from rl.ppo import PPO, STATISTICS
+from rl.profiling import profile_training
 from rl.ranks import over_ranks
 from rl.rollout import collect
 from rl.runlog import Row, RunLog
@@ -68,12 +69,21 @@ class RunSummary:
     samples: int
     minutes: float
     stopped_by: str
-    """``samples``, ``minutes`` or ``signal``."""
+    """``samples``, ``minutes``, ``signal``, or ``profile``."""
     metrics: dict[str, float]
     """Episode metrics of the last iteration in which an episode ended."""
     checkpoint: Path
+    """The last one; the trace of a profile."""
     rank: int = 0
     """Of this process; rank 0 speaks for all."""
+
+    def sentence(self) -> str:
+        """What the command says at its end."""
+        what = "trace" if self.stopped_by == "profile" else "last checkpoint"
+        return (
+            f"stopped by {self.stopped_by} after {self.samples:,} samples, "
+            f"{self.minutes:.1f} minutes; {what} {self.checkpoint}"
+        )
 
 
 def train(
@@ -100,7 +110,8 @@ def train(
     began_group = join_ranks(config.device)
     try:
         config = settle(config)
-        summary = _Trainer(config, starts, environment, on_iteration).run(part)
+        trainer = _Trainer(config, starts, environment, on_iteration)
+        summary = trainer.profile() if config.profile else trainer.run(part)
     except ValueError:  # every rank has made the same mistake
         _leave_ranks(began_group)
         raise
@@ -251,14 +262,26 @@ class _Trainer:
             if log is not None:
                 log.close()
             self.env.close()
+        return self._summary(stopped_by, saved)
+
+    def profile(self) -> RunSummary:
+        """Measures a few updates instead of training; the run's checkpoints stay as they are."""
+        began = time.monotonic() - 60.0 * self.minutes
+        try:
+            path = profile_training(self, lambda: self._iterate(began, self.config.samples))
+        finally:
+            self.env.close()
+        return self._summary("profile", path)
+
+    def _summary(self, stopped_by: str, path: Path) -> RunSummary:
         return RunSummary(
-            out=config.out,
+            out=self.config.out,
             iterations=self.iteration,
             samples=self.samples,
             minutes=self.minutes,
             stopped_by=stopped_by,
             metrics=self.metrics,
-            checkpoint=saved,
+            checkpoint=path,
             rank=self.rank,
         )
 
@@ -268,29 +291,9 @@ class _Trainer:
         cloning = self.cloning if self.iteration < self.config.clone else None
         clock = Stopwatch(self.device)
         clock.mark()
-        with one_torch_thread(self.env.device):
-            self.obs = collect(
-                self.env,
-                cloning or self.agent,
-                self.rollout,
-                self.obs,
-                self.hyper.gamma,
-                on_step=self._watch,
-                bonuses=self.bonuses,
-            )
-        merge = getattr(self.env, "merge_ranks", None)
-        if self.ranks > 1 and merge is not None:  # what the environment learns from its episodes
-            merge()
-        if self.style is not None:
-            self.style.pay(self.rollout, self.env.reward_scale)
+        self._play()
         clock.mark()
-        losses: dict[str, Tensor] = {}
-        if self.iteration < self.first_learning:
-            self.agent.obs_norm.commit()
-        else:
-            losses = self.agent.update(self.rollout)
-            losses |= self.style.update() if self.style is not None else {}
-            losses |= cloning.update(self.rollout, self.iteration) if cloning is not None else {}
+        losses = self._learn()
         clock.mark()
         row: Row = {"iteration": self.iteration + 1}
         rates = {"learning_rate": self.agent.learning_rate, "sigma": self.agent.sigma}
@@ -339,6 +342,32 @@ class _Trainer:
             **summary,
         }
         return row | counts_now | {k: means_now[k] for k in levels}
+
+    def _play(self) -> None:
+        """Fills the rollout."""
+        with one_torch_thread(self.env.device):
+            self.obs = collect(
+                self.env,
+                self.agent,
+                self.rollout,
+                self.obs,
+                self.hyper.gamma,
+                on_step=self._watch,
+                bonuses=self.bonuses,
+            )
+        merge = getattr(self.env, "merge_ranks", None)
+        if self.ranks > 1 and merge is not None:  # what the environment learns from its episodes
+            merge()
+        if self.style is not None:
+            self.style.pay(self.rollout, self.env.reward_scale)
+
+    def _learn(self) -> dict[str, Tensor]:
+        """Learns from the rollout; returns () statistics."""
+        if self.iteration < self.first_learning:
+            self.agent.obs_norm.commit()
+            return {}
+        losses = self.agent.update(self.rollout)
+        return losses | (self.style.update() if self.style is not None else {})
 
     def _number(self, x: Tensor | int) -> Tensor:
         """(1,) float64 on the learner's device."""
@@ -469,10 +498,7 @@ def main(args: list[str] | None = None) -> int:
             print(f"error: {'' if rank == '0' else f'rank {rank}: '}{error}", file=sys.stderr)
         return 2
     if summary.rank == 0:
-        print(
-            f"stopped by {summary.stopped_by} after {summary.samples} samples; last checkpoint "
-            f"{summary.checkpoint}"
-        )
+        print(summary.sentence())
     return 0
 
 
