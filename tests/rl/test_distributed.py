@@ -19,6 +19,8 @@ from rl.runlog import read_progress
 from rl.train import main, train
 from tests.rl import rank_work
 from tests.rl.toy import toy_config, toy_env
+from tests.warmstart.clips_made import random_clip
+from warmstart.library import pack
 
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
@@ -149,3 +151,29 @@ def test_more_processes_than_gpus_are_refused_with_a_sentence(monkeypatch, capsy
     assert main(["long_jump", "--out", str(tmp_path / "run")]) == 2
     assert "--nproc-per-node 2" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+def test_trackers_of_two_ranks_learn_from_each_others_failures(tmp_path):
+    """The command line itself."""
+    clips = tmp_path / "clips.npz"
+    pack([("one", random_clip(0)), ("two", random_clip(1, 40))]).save(clips)
+    run = tmp_path / "run"
+    small = [
+        "--ppo.hidden",
+        "16",
+        "--ppo.steps",
+        "8",
+        "--ppo.minibatches",
+        "1",
+        "--ppo.epochs",
+        "1",
+    ]
+    args = ["tracking", "--clips", str(clips), "--task.split", "all", "--worlds", "8"]
+    done = launch("-m", "rl.train", *args, *small, "--out", str(run), "--samples", "512")
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "2 processes with 8 worlds each" in done.stdout
+    assert done.stdout.count("stopped by samples after 512 samples") == 1
+    zero, one = (load_checkpoint(checkpoints(run)[-1], r)[1] for r in (0, 1))
+    assert torch.equal(zero["env/tracking/failure"], one["env/tracking/failure"])
+    assert float(zero["env/tracking/failure"].min()) < 1.0
+    assert not torch.equal(zero["env/qpos"], one["env/qpos"])
