@@ -46,8 +46,11 @@ class Phases:
         self._mark()
 
     def wrap(self, owner: Any, method: str, name: str) -> None:
-        """From now on the time of ``owner.method`` counts as ``name``."""
-        plain = getattr(owner, method)
+        """From now on the time of ``owner.method`` counts as ``name``. Where there is none, nothing
+        happens: learners differ in their parts."""
+        plain = getattr(owner, method, None)
+        if plain is None:
+            return
 
         def timed(*args: Any, **options: Any) -> Any:
             with self.of(name):
@@ -214,21 +217,16 @@ def lines(figures: dict[str, Any], cuda: bool) -> list[str]:
 def _name_parts(phases: Phases, trainer: Any) -> None:
     env, agent, style = trainer.env, trainer.agent, trainer.style
     physics = getattr(env, "physics", None)
-    if physics is not None:
-        phases.wrap(physics, "step", SIMULATION)
+    phases.wrap(physics, "step", SIMULATION)
     phases.wrap(env, "step", SENSES if physics is not None else SIMULATION)
     for method in ("act", "prepare"):
         phases.wrap(agent, method, POLICY)
     phases.wrap(agent, "_compute_advantages", ADVANTAGES)
     phases.wrap(agent, "update", UPDATE)
-    shared = [getattr(agent._step, "shared", None)]
-    if style is not None:
-        for method in ("watch", "pay", "update"):
-            phases.wrap(style, method, STYLE)
-        shared.append(getattr(style._train, "shared", None))
-    for gradients in shared:
-        if gradients is not None:
-            phases.wrap(gradients, "average", RANKS)
+    for method in ("watch", "pay", "update"):
+        phases.wrap(style, method, STYLE)
+    for step in (getattr(agent, "_step", None), getattr(style, "_train", None)):
+        phases.wrap(getattr(step, "shared", None), "average", RANKS)
     phases.wrap(trainer, "_watch", STATISTICS)
     inner = trainer._play
 

@@ -58,7 +58,7 @@ class SharedStep:
     def __init__(
         self,
         shared: SharedGradients,
-        gradients: Callable[[Tensor], None],
+        gradients: Callable[[Tensor], object],
         descend: Callable[[], None],
         wanted: bool,
     ) -> None:

@@ -57,7 +57,8 @@ def gradient(rows: slice) -> dict[str, Tensor]:
     r.truncated.copy_((kind > 0.1) & (kind < 0.2))
     r.valid.copy_(kind < 0.9)
     agent.update(r)
-    found = {f"gradient/{k}": p.grad.clone() for k, p in agent._named_parameters().items()}
+    grads = {k: p.grad for k, p in agent._named_parameters().items()}
+    found = {f"gradient/{k}": g.clone() for k, g in grads.items() if g is not None}
     norms = {"obs": agent.obs_norm, "value": agent.value_norm}
     return found | {f"norm/{k}": n.state_dict()["total"] for k, n in norms.items()}
 
