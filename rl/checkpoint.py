@@ -38,6 +38,14 @@ def checkpoints(run: Path) -> list[Path]:
     return sorted((run / "checkpoints").glob("step_*"))
 
 
+def ranks_of(path: Path) -> int:
+    """Processes whose part is in a checkpoint. Rank 0's part alone is enough to go on from."""
+    found = 0
+    while (path / f"rank{found}.json").is_file():
+        found += 1
+    return max(found, 1)
+
+
 def save_checkpoint(
     run: Path,
     iteration: int,

@@ -97,7 +97,8 @@ class Trace:
     """What a trace of several rollouts and updates tells."""
 
     device_busy: float | None
-    """Share of the time in which the device computed or copied; None without one."""
+    """Share of the time since the first rollout in which the device computed or copied; None
+    without one."""
     waits: dict[str, int]
     """Calls by which the host waited for the device while rollouts were played, by name."""
 
@@ -117,8 +118,8 @@ def read_trace(path: Path) -> Trace:
             if any(begin <= e["ts"] <= end for begin, end in rollouts):
                 waits[e["name"]] += 1
     busy = None
-    if work:
-        begin, end = min(e["ts"] for e in events), max(e["ts"] + e["dur"] for e in events)
+    if work and rollouts:
+        begin, end = min(a for a, _ in rollouts), max(b for _, b in work)
         busy = _covered(work) / (end - begin)
     return Trace(busy, dict(waits))
 

@@ -26,7 +26,7 @@ from rl.checkpoint import (
     CheckpointError,
     checkpoints,
     load_checkpoint,
-    read_state,
+    ranks_of,
     save_checkpoint,
 )
 from rl.cloning import STATISTIC as CLONE_ERROR
@@ -463,7 +463,7 @@ class _Trainer:
     def _restore(self) -> Tensor:
         """Takes the last checkpoint back; returns the observation to go on from."""
         path = checkpoints(self.config.out)[-1]
-        saved = int(read_state(path)["ranks"])
+        saved = ranks_of(path)
         state, tensors = load_checkpoint(path, self.rank % saved)
 
         def part(prefix: str) -> dict[str, Tensor]:
@@ -479,6 +479,11 @@ class _Trainer:
         self.iteration, self.samples = state["iteration"], state["samples"]
         self.minutes, self.warmup = state["minutes"], state["warmup"]
         self.metrics = state["card"]["metrics"]
+        if saved < self.ranks and self.rank == 0 and not self.config.quiet:
+            print(
+                f"{path} has the worlds of {saved} processes: the others begin with copies of them",
+                flush=True,
+            )
         if self.rank >= saved:  # the worlds of another rank, but not its future
             part_of_run = 1_000_003 * self.rank + self.iteration
             for k, owner in enumerate((self.agent, self.env, self.style)):

@@ -114,6 +114,8 @@ def test_a_run_of_two_ranks_goes_on_with_one_and_back(together, tmp_path):
     """The learner is kept; a rank without a state of its own takes another's worlds, not its
     noise."""
     shutil.copytree(together / "run", tmp_path / "run")
+    for part in checkpoints(tmp_path / "run")[-1].glob("rank1*"):  # not needed for it
+        part.unlink()
     before = load_checkpoint(checkpoints(tmp_path / "run")[-1])[1]
     alone = train(toy_config(tmp_path / "run", samples=7 * 2048, resume=True), environment=toy_env)
     assert alone.samples == 7 * 2048 and alone.iterations == 8  # 1024 each now
@@ -128,11 +130,12 @@ def test_a_run_of_two_ranks_goes_on_with_one_and_back(together, tmp_path):
         "from rl.train import train\n"
         "from tests.rl.toy import toy_config, toy_env\n"
         "torch.set_num_threads(1)\n"
-        "run = toy_config(pathlib.Path(sys.argv[1]), samples=9 * 2048, resume=True)\n"
+        "run = toy_config(pathlib.Path(sys.argv[1]), samples=9 * 2048, resume=True, quiet=False)\n"
         "train(run, environment=toy_env)\n"
     )
     done = launch(str(script), str(tmp_path / "run"))
     assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout.count("worlds of 1 processes: the others begin with copies") == 1
     zero, one = (load_checkpoint(checkpoints(tmp_path / "run")[-1], r)[1] for r in (0, 1))
     assert torch.equal(zero["agent/actor.head.weight"], one["agent/actor.head.weight"])
     assert not torch.equal(zero["env/x"], one["env/x"])
