@@ -24,6 +24,7 @@ from warmstart.library import pack
 
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+LAUNCH += ["--local-addr", "127.0.0.1"]
 
 
 def launch(*args: str) -> subprocess.CompletedProcess[str]:

@@ -17,7 +17,8 @@ pytestmark = pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two
 
 def test_two_gpus_learn_the_same_with_and_without_graphs(tmp_path):
     script = str(Path(__file__).with_name("rank_work_gpu.py"))
-    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    launch = ["-m", "torch.distributed.run", "--standalone", "--local-addr", "127.0.0.1"]
+    launch += ["--nproc-per-node", "2"]
     done = subprocess.run(
         [sys.executable, *launch, script, str(tmp_path)],
         cwd=ROOT,
