@@ -22,7 +22,7 @@ _ALIGNED = 64
 class SharedGradients:
     """Gradients of parameters and a few numbers beside them, in one buffer for one message.
 
-    The parameters' ``grad`` are views of the buffer from now on: never set them to None.
+    The parameters' ``grad`` are views of the buffer, again after each ``clear``.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], numbers: int = 0) -> None:
@@ -35,12 +35,17 @@ class SharedGradients:
         self._flat = torch.zeros(at, device=shared[0].device)
         self.numbers = self._flat[:numbers]
         """(numbers,) float32"""
-        for p, begin in zip(shared, begins):
-            p.grad = self._flat[begin : begin + p.numel()].view_as(p)
+        self._parts = [
+            (p, self._flat[begin : begin + p.numel()].view_as(p))
+            for p, begin in zip(shared, begins)
+        ]
+        self.clear()
 
     def clear(self) -> None:
         """All zero, before a backward pass adds to them."""
         self._flat.zero_()
+        for p, part in self._parts:  # another optimiser may have put its own in their place
+            p.grad = part
 
     def average(self) -> None:
         """Everything becomes its mean over the ranks."""

@@ -288,7 +288,6 @@ class _Trainer:
     def _iterate(self, began: float, stop_samples: int | None) -> Row:
         """One rollout and its update. Waits for the device once, for the numbers of the row."""
         self._schedule(self._share(stop_samples))
-        cloning = self.cloning if self.iteration < self.config.clone else None
         clock = Stopwatch(self.device)
         clock.mark()
         self._play()
@@ -348,7 +347,7 @@ class _Trainer:
         with one_torch_thread(self.env.device):
             self.obs = collect(
                 self.env,
-                self.agent,
+                self._cloning or self.agent,
                 self.rollout,
                 self.obs,
                 self.hyper.gamma,
@@ -367,7 +366,15 @@ class _Trainer:
             self.agent.obs_norm.commit()
             return {}
         losses = self.agent.update(self.rollout)
-        return losses | (self.style.update() if self.style is not None else {})
+        losses |= self.style.update() if self.style is not None else {}
+        if self._cloning is not None:
+            losses |= self._cloning.update(self.rollout, self.iteration)
+        return losses
+
+    @property
+    def _cloning(self) -> Cloning | None:
+        """In the first iterations of a run that clones."""
+        return self.cloning if self.iteration < self.config.clone else None
 
     def _number(self, x: Tensor | int) -> Tensor:
         """(1,) float64 on the learner's device."""

@@ -56,6 +56,7 @@ def gradient(rows: slice) -> dict[str, Tensor]:
     r.terminated.copy_(kind < 0.1)
     r.truncated.copy_((kind > 0.1) & (kind < 0.2))
     r.valid.copy_(kind < 0.9)
+    agent.actor.zero_grad(set_to_none=True)  # as another optimiser of the actor may do
     agent.update(r)
     grads = {k: p.grad for k, p in agent._named_parameters().items()}
     found = {f"gradient/{k}": g.clone() for k, g in grads.items() if g is not None}
