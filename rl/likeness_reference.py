@@ -120,8 +120,8 @@ class Reference:
 
         ``archives``: each archive against all others; ``halves``: divisions by archive;
         ``clips``: divisions by clip, in which both halves have the same archives. Lists of values.
-        ``high`` is the largest of the first two (of the third without a second archive): what
-        other people, recorded and doing something else, differ by.
+        ``high`` is the upper quantile of ``BAND`` of the first two together (of the third without a
+        second archive): what people differ by who were recorded elsewhere and do something else.
         """
         if self.known_floors is not None:
             return self.known_floors
@@ -137,7 +137,7 @@ class Reference:
             out["classifier"][kind] = [round(c, 4) for _, c in compared if not np.isnan(c)]
         for row in out.values():
             strict = row["archives"] + row["halves"] or row["clips"]
-            row["high"] = max(strict) if strict else None
+            row["high"] = round(float(np.quantile(strict, BAND[1])), 4) if strict else None
         return out
 
     def _compare(self, side: np.ndarray) -> tuple[float, float]:

@@ -8,9 +8,10 @@ and simulated motions are treated alike.
   jerk of Balasubramanian et al. 2015 (J NeuroEng Rehabil 12:112) with its sign turned, so that more
   is rougher. It does not depend on how far or how fast, so a sprint may be as smooth as a stroll.
   Windows in which a part hardly moves (peak below 0.2 m/s) say nothing and are left out.
-* ``skating``: m/s at which a foot on the ground slides. A foot is down while points of its sole
-  stay within 3 cm of the ground for three frames; the slowest of them counts, so that a foot that
-  rolls or turns on its ball does not slide.
+* ``skating``: m/s at which a foot on the ground slides. A foot is down while its lowest point is
+  within 1.5 cm of the ground; of the points of its sole below 3 cm the slowest counts, so that a foot
+  that rolls or turns on its ball does not slide. What lasts less than two frames does not count:
+  touch-down and take-off fall between frames, and the foot of a sprinter is down for three.
 * ``penetration``: m that the lowest point of the body is below the ground, in one frame of twenty
   more.
 * ``torque``, ``torque_rate``, ``power``: the largest share of what a person has, see ``effort``.
@@ -25,7 +26,7 @@ import numpy as np
 import torch
 
 from rl.likeness_motion import Drive, Motion, moving_dofs
-from rl.motion import LinkMotion, link_motion
+from rl.motion import DOWN, LinkMotion, link_motion
 from sports.humanoid.body import Body, load_body
 from sports.physics.base import Geometry
 from warmstart.library import FPS
@@ -38,7 +39,7 @@ KEY_LINKS = ("Head", "L_Wrist", "R_Wrist", "L_Ankle", "R_Ankle")
 STILL = 0.2
 """m/s; a path whose fastest moment is slower has no jerk to speak of."""
 LOW = 0.03
-"""m; a point of a sole that is lower may be on the ground."""
+"""m; points of a sole that are lower slide with it, while its lowest is below ``DOWN``."""
 FEET = (("L_Ankle", "L_Toe"), ("R_Ankle", "R_Toe"))
 PERCENTILE = 95.0
 """Of a motion's frames: a figure of effort that is exceeded in one frame of twenty."""
@@ -119,16 +120,27 @@ def skating(body: Body, links: LinkMotion) -> float:
     geometry = _geometry(body.name)
     points = _points(geometry, links)
     height = points[..., 2] - geometry.radii.double().numpy()
-    low = height < LOW
-    stays = low[:-2] & low[1:-1] & low[2:]
-    speed = np.linalg.norm(points[2:, :, :2] - points[:-2, :, :2], axis=-1) * (FPS / 2.0)
+    step = np.linalg.norm(np.diff(points[..., :2], axis=0), axis=-1) * FPS  # (T - 1, K)
     owner = geometry.owner.numpy()
     slides = []
     for foot in FEET:
         mine = np.isin(owner, [body.link_index(name) for name in foot])
-        slowest = np.where(stays[:, mine], speed[:, mine], np.inf).min(1)
-        slides.append(slowest[np.isfinite(slowest)])
+        low = (height[:, mine] < LOW) & (height[:, mine].min(1) < DOWN)[:, None]
+        slowest = np.where(low[:-1] & low[1:], step[:, mine], np.inf).min(1)
+        lasting = _opened(slowest)
+        slides.append(lasting[np.isfinite(lasting)])
     return _mean(np.concatenate(slides))
+
+
+def _opened(speed: np.ndarray) -> np.ndarray:
+    """(K,) the most that each value keeps up together with a neighbour; inf where it has none.
+
+    A grey-scale opening over two values; inf are gaps.
+    """
+    pair = np.minimum(speed[:-1], speed[1:])
+    pair = np.where(np.isfinite(np.maximum(speed[:-1], speed[1:])), pair, -np.inf)
+    most = np.maximum(np.append(pair, -np.inf), np.insert(pair, 0, -np.inf))
+    return np.where(most >= 0.0, most, np.inf)
 
 
 def penetration(body: Body, links: LinkMotion) -> float:
