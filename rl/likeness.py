@@ -2,8 +2,8 @@
 
 Each figure is compared with that of people whom no training saw (``rl.likeness_reference``): jerk,
 sliding feet and sinking into the ground by quantiles of their clips, torque, torque rate and power
-with the limits of docs/strength.md, and the distribution of 1 s windows by a Frechet distance and by
-a fresh classifier, which are compared with what people come to among themselves.
+with the limits of docs/strength.md, and the distribution of 1 s windows by a Frechet distance and
+by a fresh classifier, which are compared with what people come to among themselves.
 
     panel = likeness_of_policy("pretrained", "hurdling")
 """
@@ -20,7 +20,7 @@ import numpy as np
 from rl import provenance
 from rl.evaluate import evaluate, interval
 from rl.likeness_features import window_features
-from rl.likeness_motion import Motion, from_recording, seen_in_training, short_name
+from rl.likeness_motion import Motion, Seen, from_recording, seen_in_training, short_name
 from rl.likeness_reference import FEWEST, FIGURES, Reference
 from rl.likeness_terms import EFFORT, UNITS, figures
 from rl.policy import Policy, load_policy
@@ -32,6 +32,7 @@ LIMITED = EFFORT[:3]
 """Figures in units of what a person has at most; those per kg say the same in other units."""
 ROUNDING = 1e-3
 """Of a limit: an athlete at his limit has not exceeded it."""
+NOTHING = Seen(frozenset(), frozenset())
 DISTRIBUTION = {"frechet": "feature units^2", "classifier": "fraction"}
 
 
@@ -40,7 +41,7 @@ def panel(
     reference: Reference,
     *,
     facts: Mapping[str, Any] | None = None,
-    seen: Sequence[str] = (),
+    seen: Seen = NOTHING,
 ) -> dict[str, Any]:
     """The panel of some motions, plain JSON.
 
@@ -48,7 +49,7 @@ def panel(
         motions: of one policy or source.
         reference: people to compare with; clips that are among the motions are left out.
         facts: what decided the motions (task, policy, engine, ...), at the top of the result.
-        seen: names of further clips to leave out, those that training saw.
+        seen: what training used; it is left out of the reference too.
 
     ``likeness`` has for each figure {"mean", "ci95", "n", "unit", "human": {"low", "high", "n"},
     "within"}; ``within`` tells whether the mean is at most ``high`` (less than a person's is no
@@ -57,8 +58,8 @@ def panel(
     """
     if not motions:
         raise ValueError("there is no motion to measure")
-    apart = {*seen, *(short_name(m.name) for m in motions)}
-    used = reference.without(apart)
+    apart = {*seen.clips, *(short_name(m.name) for m in motions)}
+    used = reference.without(apart, seen.archives)
     rows = [figures(motion) for motion in motions]
     out: dict[str, Any] = {}
     for name, unit in UNITS.items():
@@ -164,7 +165,7 @@ def likeness_of_episodes(
         motions,
         reference or Reference.load(),
         facts=facts,
-        seen=sorted(seen_in_training(dict(card))),
+        seen=seen_in_training(dict(card)),
     )
 
 

@@ -12,8 +12,8 @@ numbers:
   (0.5 to 1.5, 2 to 3.5, 4 to 7.5, 8 to 15 Hz). Projections of four coefficients do not see
   jitter; these do.
 
-Units are divided by fixed scales, those of ordinary motion, and each family of channels has the same
-weight however many channels it has.
+Units are divided by fixed scales, those of ordinary motion, and each family of channels has the
+same weight however many channels it has.
 """
 
 from __future__ import annotations
@@ -76,11 +76,11 @@ def channels(motion: Motion) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndar
     """Channels of each frame by family, scaled and weighted; joint spins and speeds in units.
 
     Vectors are in the heading frame (yaw of the pelvis), so that where the athlete is and which
-    way it faces do not matter. ``height`` of the pelvis above the ground; ``attitude`` of the pelvis
-    and ``joints``: the first two columns of rotation matrices (Zhou et al. 2019); ``velocity`` and
-    ``spin`` of the pelvis; ``joint_spin``: angular velocity of each link against its parent, in its
-    own frame; ``places`` of head, hands and feet from the pelvis. Fingers are left out, and SMPL's
-    stiff hand, so that both bodies have the same channels.
+    way it faces do not matter. ``height`` of the pelvis above the ground; ``attitude`` of the
+    pelvis and ``joints``: the first two columns of rotation matrices (Zhou et al. 2019);
+    ``velocity`` and ``spin`` of the pelvis; ``joint_spin``: angular velocity of each link against
+    its parent, in its own frame; ``places`` of head, hands and feet from the pelvis. Fingers are left
+    out, and SMPL's stiff hand, so that both bodies have the same channels.
 
     Returns the families ((T, C) each), (T, 3 J) joint spins (rad/s) and (T, 15) velocities (m/s)
     of head, hands and feet against the pelvis.

@@ -140,15 +140,51 @@ def read_motions(source: str | Path) -> list[Motion]:
     return [motion for file in files for motion in read_motions(file)]
 
 
-def seen_in_training(card: dict[str, Any]) -> set[str]:
-    """Names, without folder and suffix, of the clip files that a policy's card says it saw.
+@dataclass(frozen=True)
+class Seen:
+    """What training used, by a policy's card."""
 
-    A packed library is told by its digest, not by its clips: training never sees those that are
-    held out of it.
+    clips: frozenset[str]
+    """Names of clip files without folder and suffix."""
+    archives: frozenset[str]
+    """Archives of which also the held-out clips were used."""
+
+
+def seen_in_training(card: dict[str, Any]) -> Seen:
+    """Clips and archives that a policy's card, or that of a model inside it, says it saw.
+
+    A tracker's library is told by its archives: of those training leaves out the held-out clips,
+    unless the card's split says otherwise. Raises ValueError where the card does not say which
+    clips a style was learned from.
     """
-    config = card.get("config")
-    files: Iterable[Any] = (config.get("clips") or ()) if isinstance(config, dict) else ()
-    return {Path(str(f)).name.removesuffix(".npz") for f in files}
+    clips: set[str] = set()
+    archives: set[str] = set()
+    for part in _parts(card):
+        config = part.get("config")
+        config = config if isinstance(config, dict) else {}
+        library = part.get("library")
+        options = config.get("options")
+        split = options.get("split", "train") if isinstance(options, dict) else "train"
+        if isinstance(library, dict) and split != "train":
+            archives |= set(library.get("archives", ()))
+        for file in config.get("clips") or ():
+            name = Path(str(file)).name
+            if not name.endswith(".npz") and part.get("algo", "ppo") != "ppo":
+                raise ValueError(
+                    f"the policy learned from the clips of a folder '{name}', and its card does "
+                    "not say which: its likeness cannot be measured against clips that it may have "
+                    "seen"
+                )
+            clips.add(name.removesuffix(".npz"))
+    return Seen(frozenset(clips), frozenset(archives))
+
+
+def _parts(card: dict[str, Any]) -> Iterable[dict[str, Any]]:
+    """A card and the cards within it (a prior's, a tracker's)."""
+    yield card
+    for name, value in card.items():
+        if isinstance(value, dict) and name not in ("config", "library"):
+            yield from _parts(value)
 
 
 def short_name(name: str) -> str:
@@ -178,9 +214,7 @@ def moving_dofs(body: Body) -> np.ndarray:
     return np.array([i for i, dof in enumerate(body.dofs) if not is_finger(dof.link)])
 
 
-def _drive(
-    body: Body, qpos: np.ndarray, qvel: np.ndarray, targets: np.ndarray, dt: float
-) -> Drive:
+def _drive(body: Body, qpos: np.ndarray, qvel: np.ndarray, targets: np.ndarray, dt: float) -> Drive:
     """Of frames (T, ...) and the targets (T - 1, n) held between them."""
     dofs = moving_dofs(body)
     kp, kd, effort = (body.array(f)[dofs] for f in ("kp", "kd", "effort"))

@@ -74,13 +74,18 @@ class Reference:
         """(W,) name of the clip of each window."""
         return [self.names[i] for i in self.clip_of]
 
-    def without(self, names: Iterable[str]) -> Reference:
-        """The clips but those whose names without folders are among ``names``.
+    def without(self, names: Iterable[str], archives: Iterable[str] = ()) -> Reference:
+        """The clips but those whose names without folders are among ``names``, and without some
+        archives.
 
         Raises ValueError if too few windows are left to compare with.
         """
-        names = set(names)
-        keep = [i for i, name in enumerate(self.names) if short_name(name) not in names]
+        names, archives = set(names), set(archives)
+        keep = [
+            i
+            for i, (name, group) in enumerate(zip(self.names, self.groups))
+            if short_name(name) not in names and group not in archives
+        ]
         if len(keep) == len(self.names):
             return self
         rest = self._chosen(keep)
@@ -143,9 +148,12 @@ class Reference:
     def _compare(self, side: np.ndarray) -> tuple[float, float]:
         """Distance and accuracy between the clips (C,) where ``side`` and the others."""
         rows = side[self.clip_of]
-        names = np.asarray(self.window_names())
         a, b = self.features[rows], self.features[~rows]
-        return frechet(a, b), classifier_accuracy(a, names[rows], b, names[~rows])
+        mine, others = (
+            [n for n, inside in zip(self.window_names(), rows) if inside == wanted]
+            for wanted in (True, False)
+        )
+        return frechet(a, b), classifier_accuracy(a, mine, b, others)
 
     def _windows(self, side: np.ndarray) -> int:
         """Windows of the smaller part."""
@@ -230,9 +238,7 @@ class Reference:
             floors = json.loads(json.dumps(head["floors"]))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is not a readable likeness reference: {error}") from error
-        return Reference(
-            names, groups, licences, counts, features, table, seconds, origin, floors
-        )
+        return Reference(names, groups, licences, counts, features, table, seconds, origin, floors)
 
 
 def reference_of(motions: Sequence[Motion], origin: str) -> Reference:
@@ -271,7 +277,7 @@ def reference_of_library(library: Library, *, open_only: bool = False) -> Refere
 
 
 def non_commercial(licence: str) -> bool:
-    """Whether a licence is known or must be feared to forbid use for money."""
+    """Whether a licence forbids commercial use, or is unknown and may."""
     words = licence.upper().replace("-", " ").replace("(", " ").split()
     return "NC" in words or licence == "unknown"
 

@@ -9,9 +9,9 @@ and simulated motions are treated alike.
   is rougher. It does not depend on how far or how fast, so a sprint may be as smooth as a stroll.
   Windows in which a part hardly moves (peak below 0.2 m/s) say nothing and are left out.
 * ``skating``: m/s at which a foot on the ground slides. A foot is down while its lowest point is
-  within 1.5 cm of the ground; of the points of its sole below 3 cm the slowest counts, so that a foot
-  that rolls or turns on its ball does not slide. What lasts less than two frames does not count:
-  touch-down and take-off fall between frames, and the foot of a sprinter is down for three.
+  within 1.5 cm of the ground; of the points of its sole below 3 cm the slowest counts, so that a
+  foot that rolls or turns on its ball does not slide. What lasts less than two frames does not
+  count: touch-down and take-off fall between frames, and a sprinter's foot is down for three.
 * ``penetration``: m that the lowest point of the body is below the ground, in one frame of twenty
   more.
 * ``torque``, ``torque_rate``, ``power``: the largest share of what a person has, see ``effort``.
