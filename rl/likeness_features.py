@@ -79,8 +79,8 @@ def channels(motion: Motion) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndar
     way it faces do not matter. ``height`` of the pelvis above the ground; ``attitude`` of the
     pelvis and ``joints``: the first two columns of rotation matrices (Zhou et al. 2019);
     ``velocity`` and ``spin`` of the pelvis; ``joint_spin``: angular velocity of each link against
-    its parent, in its own frame; ``places`` of head, hands and feet from the pelvis. Fingers are left
-    out, and SMPL's stiff hand, so that both bodies have the same channels.
+    its parent, in its own frame; ``places`` of head, hands and feet from the pelvis. Fingers are
+    left out, and SMPL's stiff hand, so that both bodies have the same channels.
 
     Returns the families ((T, C) each), (T, 3 J) joint spins (rad/s) and (T, 15) velocities (m/s)
     of head, hands and feet against the pelvis.
