@@ -49,8 +49,8 @@ def test_shipped_reference_is_of_open_recordings_that_are_held_out(people: Refer
 
 
 def test_held_out_people_pass_among_themselves(people: Reference) -> None:
-    # Divided by clip the classifier can but guess; each archive is as near to the others as allowed,
-    # but for one of tumbling in 15 windows.
+    # Divided by clip the classifier can but guess; each archive is as near to the others as
+    # allowed, but for one of tumbling in 15 windows.
     assert np.mean(people.floors["classifier"]["clips"]) == pytest.approx(0.5, abs=0.1)
     passed = {}
     for archive in sorted(set(people.groups)):

@@ -17,8 +17,8 @@ from rl.likeness_motion import from_clip
 from rl.likeness_terms import WINDOW
 from sports.humanoid.body import load_body
 from tests.rl.motions_still import lifted, slid, standing, swinging
-from warmstart.clip import Clip
 from warmstart.bank import demonstration_files
+from warmstart.clip import Clip
 from warmstart.library import FPS
 
 
