@@ -48,6 +48,20 @@ TORQUE_RISE = 20.0
 about 0.1 s to its full torque (Maffiuletti et al. 2016, Eur J Appl Physiol 116:1091), and as many
 for the antagonists that let go. An estimate."""
 LEG_AXES = ("Hip_y", "Knee_y", "Ankle_y")
+UNMEASURED = (
+    "Hand",
+    "Toe",
+    "Thorax",
+    "Knee_x",
+    "Knee_z",
+    "Ankle_x",
+    "Ankle_z",
+    "Elbow_x",
+    "Elbow_y",
+)
+"""Links and dofs whose limits in the human table are structural or estimates (docs/strength.md):
+torque and its rate are not judged by them. With them a policy of strength ``paper`` would be judged
+by its hands, at 20 times a guess."""
 
 UNITS = {
     "jerk": "ln",
@@ -157,22 +171,24 @@ def effort(body: Body, drive: Drive) -> dict[str, float]:
     ``torque``: of the strongest dof in a frame, what the human torque-speed line (docs/strength.md)
     asks of its muscle, (torque + kd speed) / limit; above 1 no person has it. ``torque_rate``: the
     fastest change of a dof's mean torque from step to step, over ``TORQUE_RISE`` limits a second.
-    ``power``: positive power of all dofs, over that of hips, knees and ankles of both legs
-    extending at their best speeds at once (effort * no-load speed / 4 of each). Each is the value
-    that one frame of twenty exceeds; NaN with fewer than two steps.
+    Both of the dofs whose limits were measured, see ``UNMEASURED``. ``power``: positive power of
+    all dofs, over that of hips, knees and ankles of both legs extending at their best speeds at
+    once (effort * no-load speed / 4 of each). Each is the value that one frame of twenty exceeds;
+    NaN with fewer than two steps.
     """
     human = load_body(body.name, strength="human")
     dofs = moving_dofs(human)
     limit, slope = human.array("effort")[dofs], human.array("kd")[dofs]
     if len(drive.torque) < 2:
         return dict.fromkeys(EFFORT, np.nan)
-    asked = np.abs(drive.torque + slope * drive.speed) / limit
+    judged = np.array([_measured(human.dofs[i].name) for i in dofs])
+    asked = (np.abs(drive.torque + slope * drive.speed) / limit)[..., judged]
     mean = drive.torque.mean(1)
     change = np.abs(np.diff(mean, axis=0)) / drive.dt
     power = np.maximum(drive.torque * drive.speed, 0.0).sum(-1)
     return {
         "torque": _high(asked.max((1, 2))),
-        "torque_rate": _high((change / (TORQUE_RISE * limit)).max(1)),
+        "torque_rate": _high((change / (TORQUE_RISE * limit))[:, judged].max(1)),
         "power": _high(power.mean(1)) / leg_power(body.name),
         "torque_per_kg": _high(np.abs(drive.torque).max((1, 2))) / human.mass,
         "torque_rate_per_kg": _high(change.max(1)) / human.mass,
@@ -185,6 +201,11 @@ def leg_power(name: str) -> float:
     human = load_body(name, strength="human")
     dofs = [d for d in human.dofs if d.name[2:] in LEG_AXES]
     return sum(d.effort**2 / d.kd / 4.0 for d in dofs)
+
+
+def _measured(dof: str) -> bool:
+    name = dof.removeprefix("L_").removeprefix("R_")
+    return name not in UNMEASURED and name.rpartition("_")[0] not in UNMEASURED
 
 
 def _points(geometry: Geometry, links: LinkMotion) -> np.ndarray:

@@ -173,4 +173,14 @@ def test_torques_of_an_episode_are_those_that_mujoco_applies(strength: str) -> N
                 drive.torque[step, end], want[moving_dofs(body)], rtol=1e-4, atol=1e-3
             )
     share = figures(motion)["torque"]
-    assert share <= 1.0 + 1e-6 if strength == "human" else share > 5.0
+    assert share <= 1.0 + 1e-6 if strength == "human" else share > 2.0
+
+
+def test_hands_and_ligaments_do_not_judge_the_torque() -> None:
+    human = load_body("smpl", strength="human")
+    torque, speed = np.zeros((40, 2, 69)), np.zeros((40, 2, 69))
+    for name in ("L_Hand_x", "R_Toe_y", "L_Knee_x"):
+        torque[..., human.dof_index(name)] = 400.0
+    assert effort(BODY, Drive(torque, speed, 1 / 30))["torque"] == 0.0
+    torque[..., human.dof_index("R_Wrist_x")] = 30.0
+    assert effort(BODY, Drive(torque, speed, 1 / 30))["torque"] == pytest.approx(1.5)
