@@ -65,7 +65,7 @@ def panel(
     for name, unit in UNITS.items():
         row = interval(np.array([r[name] for r in rows]), unit)
         if name in FIGURES:
-            row["human"] = used.band(name)
+            row["human"] = used.band(name, all(m.simulated for m in motions))
         elif name in LIMITED:
             row["human"] = {"low": 0.0, "high": 1.0, "n": 0}
         out[name] = row

@@ -51,6 +51,8 @@ class Motion:
     drive: Drive | None = None
     """None for a motion without known torques."""
     licence: str = ""
+    simulated: bool = False
+    """Whether an engine's ground carried it."""
 
     @property
     def seconds(self) -> float:
@@ -71,7 +73,7 @@ def from_clip(clip: Clip, name: str, group: str = "", licence: str = "") -> Moti
     meta = clip.meta
     group = group or str(meta.get("archive") or meta.get("problem") or "files")
     licence = licence or str(meta.get("licence") or "unknown")
-    return Motion(name, group, clip.body, shown.qpos, drive, licence)
+    return Motion(name, group, clip.body, shown.qpos, drive, licence, simulated=drive is not None)
 
 
 def from_library(library: Library) -> list[Motion]:
@@ -112,7 +114,7 @@ def from_recording(recording: Recording, name: str = "") -> list[Motion]:
             qpos = Clip(fps=rate, body=body.name, qpos=qpos, qvel=speeds).resample(FPS).qpos
         label = name or f"{recording.task} seed {recording.seed} world {recording.world}"
         label += f" agent {agent}" if scene.num_agents > 1 else ""
-        motions.append(Motion(label, recording.task, body.name, qpos, drive))
+        motions.append(Motion(label, recording.task, body.name, qpos, drive, simulated=True))
     return motions
 
 

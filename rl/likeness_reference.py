@@ -36,9 +36,11 @@ FIGURES = tuple(UNITS)[:3]
 """Figures that a captured motion has."""
 BAND = (0.05, 0.95)
 """Quantiles of the reference's clips between which a figure counts as human."""
-ALLOWED = {"penetration": 0.01}
-"""m that also a person's sole yields: the pad of the heel gives 9 mm in running (De Clercq et al.
-1994, J Biomech 27:1213). Captured clips were lifted out of the ground when they were made."""
+PAD, GROUND = 0.01, 0.025
+"""m that a motion may sink in: of a captured one as much as a sole yields (the pad of the heel
+gives 9 mm in running, De Clercq et al. 1994, J Biomech 27:1213), since clips were lifted out of the
+ground when they were made; of a simulated one as much as its ground yields to people: the shipped
+demonstrations sink in by up to 2.4 cm, whose effort and speed are a person's."""
 DIVISIONS = 10
 """Ways to divide the reference in two by archive, the most even ones, and as many by clip."""
 FEWEST = 8
@@ -109,14 +111,19 @@ class Reference:
             known_floors=None,
         )
 
-    def band(self, figure: str) -> dict[str, Any]:
-        """{"low", "high", "n"}: quantiles of the clips, see ``BAND``; None without clips."""
+    def band(self, figure: str, simulated: bool = False) -> dict[str, Any]:
+        """{"low", "high", "n"}: quantiles of the clips, see ``BAND``; None without clips.
+
+        For ``penetration`` ``high`` is at least what sole or ground yield, see ``PAD``.
+        """
         values = self.table[:, FIGURES.index(figure)]
         values = values[~np.isnan(values)]
         if not len(values):
             return {"low": None, "high": None, "n": 0}
         low, high = (float(np.quantile(values, q)) for q in BAND)
-        return {"low": low, "high": max(high, ALLOWED.get(figure, high)), "n": len(values)}
+        if figure == "penetration":
+            high = max(high, GROUND if simulated else PAD)
+        return {"low": low, "high": high, "n": len(values)}
 
     @cached_property
     def floors(self) -> dict[str, dict[str, Any]]:

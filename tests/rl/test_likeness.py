@@ -222,3 +222,23 @@ def test_episodes_too_short_for_windows_have_no_distribution(people: Reference) 
     assert rows["frechet"]["mean"] is None and rows["classifier"]["within"] is None
     assert rows["torque"]["within"] is False
     assert found["human_like"]["of"] < 8
+
+
+def test_a_simulated_ground_may_yield_as_it_does_under_the_demonstrations(
+    people: Reference,
+) -> None:
+    from rl.likeness_motion import from_clip
+    from rl.likeness_reference import GROUND, PAD
+    from rl.likeness_terms import figures
+    from warmstart.bank import demonstration_files
+
+    assert people.band("penetration")["high"] == PAD
+    assert people.band("penetration", simulated=True)["high"] == GROUND
+    deepest = 0.0
+    for file in demonstration_files("high_jump"):
+        motion = from_clip(Clip.load(file), file.stem)
+        assert motion.simulated
+        deepest = max(deepest, figures(motion)["penetration"])
+        row = panel([motion], people)["likeness"]["penetration"]
+        assert row["within"] and row["human"]["high"] == GROUND
+    assert PAD < deepest < GROUND
