@@ -130,7 +130,8 @@ def _task_of(source: str, tasks: Sequence[str]) -> str:
     path = Path(source)
     card = path / "config.json" if path.is_dir() else path.with_suffix(".json")
     try:
-        return str(json.loads(card.read_text(encoding="utf-8"))["task"])
+        said = json.loads(card.read_text(encoding="utf-8"))
+        return str((said["config"] if path.is_dir() else said)["task"])
     except (OSError, ValueError, KeyError, TypeError):
         raise ValueError(
             f"'{source}' is no policy, run or file of motions that says its task: give a "

@@ -43,6 +43,16 @@ def test_a_policy_file_is_played_in_the_task_of_its_card(tmp_path: Path) -> None
     assert json.loads((tmp_path / "a.json").read_text())["task"] == "long_jump"
 
 
+def test_a_run_is_played_in_the_task_that_it_trains(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    words = ["train", "long_jump", "--algo", "ppo", "--engine", "mujoco", "--worlds", "4"]
+    assert main([*words, "--samples", "200", "--out", str(run)]) == 0
+    out = tmp_path / "panels"
+    assert main(["likeness", str(run), KICK, "--trials", "1", "--out", str(out)]) == 0
+    assert json.loads((out / "likeness_run.json").read_text())["task"] == "long_jump"
+    assert (out / "likeness_penalty_kick_15mps_human.json").exists()
+
+
 def test_panel_stands_beside_the_score(tmp_path: Path, capsys) -> None:
     out = tmp_path / "jump.json"
     words = ["evaluate", "long_jump", "--policy", "pretrained", "--trials", "3", "--out", str(out)]
