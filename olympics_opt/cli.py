@@ -116,6 +116,9 @@ class Evaluate:
     """Strength of the athlete; by default the one the policy was trained with."""
     limits: Literal["paper", "anatomical"] | None = None
     """Joint ranges; by default those the policy was trained with."""
+    likeness: Path | None = None
+    """Print how human the motion looks beside the score: ``reference`` compares it with the shipped
+    figures of people, a clip library with its held-out clips (``olympics-opt likeness``)."""
 
 
 @dataclass(frozen=True)
@@ -264,6 +267,38 @@ class Tracker:
 
 
 @dataclass(frozen=True)
+class Likeness:
+    """How human motions look: jerk, sliding, effort and distribution beside those of people.
+
+    Without clips the shipped reference serves: figures of openly licensed recordings that no
+    training saw. With ``--clips`` it is made of the held-out tenth of a library.
+    """
+
+    motions: Positional[Annotated[tuple[str, ...], arg(metavar="POLICY")]] = ()
+    """Run folders, policy files, ``pretrained[:ALGO[-STRENGTH]]``, ``zero``, ``random``; or files
+    and folders of recordings, clips and libraries (.npz). By default all shipped policies."""
+    task: tuple[str, ...] = ()
+    """Sports to play: of the shipped policies only these; by default that of a policy's card."""
+    clips: tuple[Path, ...] = ()
+    """A library that ``mocap pack`` wrote, or clips (.npz) and folders of them, whose held-out
+    clips to compare with; by default the shipped reference."""
+    trials: int = 8
+    """Episodes to play with each policy."""
+    out: Path | None = None
+    """JSON file for the panel, or a folder for several (``likeness_NAME.json``)."""
+    chart: Path | None = None
+    """png or svg file for a chart of all panels beside the range of people."""
+    seed: int = 0
+    """Seed of all randomness."""
+    engine: Literal["mujoco", "warp", "drake"] = "mujoco"
+    """Physics engine; ``warp`` needs a GPU."""
+    strength: Literal["paper", "human"] | None = None
+    """Strength of the athlete; by default the one the policy was trained with."""
+    limits: Literal["paper", "anatomical"] | None = None
+    """Joint ranges; by default those the policy was trained with."""
+
+
+@dataclass(frozen=True)
 class Leaderboard:
     """Rebuild results/README.md and the results of README.md from results/*.json."""
 
@@ -305,6 +340,7 @@ COMMANDS: dict[str, Command] = {
         None, "olympics_opt.mocap:main", summary="Make clips of recorded motions of people."
     ),
     "tracker": Command(Tracker, "olympics_opt.tracker:run_tracker"),
+    "likeness": Command(Likeness, "olympics_opt.likeness:run_likeness"),
     "bench": Command(
         None, "olympics_opt.bench:main", summary="Measure physics, environment and training speed."
     ),

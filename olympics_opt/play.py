@@ -12,6 +12,10 @@ from warmstart import atomic
 if TYPE_CHECKING:
     from olympics_opt.cli import Evaluate, Export, Render, Verify
     from rl.evaluate import EvaluationResult
+    from rl.likeness_reference import Reference
+
+SHOWN = 8
+"""Worlds whose first episodes are looked at for likeness."""
 
 
 def athlete(
@@ -88,6 +92,7 @@ def play(
     timestep_divisor: int = 1,
     processes: int = 1,
     record: bool = False,
+    record_worlds: tuple[int, ...] = (),
     label: str = "",
 ) -> EvaluationResult:
     """``rl.evaluate.evaluate`` with a line of progress; its errors and its result.
@@ -110,6 +115,7 @@ def play(
             options=options,
             timestep_divisor=timestep_divisor,
             record=int(record),
+            record_worlds=record_worlds,
             processes=processes,
             progress=lambda done, total: bar.show(f"{done} of {total} trials", done, total),
         )
@@ -126,11 +132,32 @@ def run_evaluate(config: Evaluate) -> int:
     trials = asked(config)
     if config.trials >= 1:  # else the evaluation says what is wrong
         atomic.prepare(config.out)
-    played = play(**trials, engine=config.engine, worlds=config.worlds)
+    reference = None
+    if config.likeness is not None:
+        from olympics_opt.likeness import load_reference
+
+        reference = load_reference([config.likeness])
+    worlds = tuple(range(SHOWN)) if reference is not None else ()
+    played = play(**trials, engine=config.engine, worlds=config.worlds, record_worlds=worlds)
     print_metrics(played.result)
     print_training_step(config)
+    if reference is not None:
+        _add_likeness(config, played, reference)
     print(f"wrote {atomic.write_json(config.out, played.result)}")
     return 0
+
+
+def _add_likeness(config: Evaluate, played: EvaluationResult, reference: Reference) -> None:
+    """Prints the panel of human-likeness and puts it into the result."""
+    from olympics_opt.likeness import print_table
+    from rl.likeness import likeness_of_episodes
+    from rl.policy import load_policy
+
+    card = load_policy(config.policy, config.name).metadata
+    panel = likeness_of_episodes(played.result, played.recordings, card, reference)
+    print_table({f"{config.name} {played.result['algo']}": panel})
+    kept = ("motions", "seconds", "windows", "reference", "human_like", "likeness")
+    played.result["likeness"] = {name: panel[name] for name in kept}
 
 
 def print_training_step(config: Evaluate | Render | Verify) -> None:
