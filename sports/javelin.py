@@ -69,8 +69,18 @@ class Javelin:
     shaft than ever before in the episode, up to ``OPEN``, once it need not be held any more; 0 for
     the paper's terms alone. Those pay nothing for a hand that opens a little: PPO (7 M samples)
     held on until it had to have thrown."""
+    deadline: int = RELEASE_STEPS
+    """Control steps after which it must have left the hand; the rules' 48 (1.6 s), or fewer to
+    train with: the longer a hand pushes the further it throws, so an athlete that learned with the
+    rules' own deadline lets go in the very last step, shaken loose by the noise of its actions, and
+    without that noise never does."""
 
     def __post_init__(self) -> None:
+        if not THROW_STEPS < self.deadline <= RELEASE_STEPS:
+            raise ValueError(
+                f"the deadline must be above {THROW_STEPS} and at most {RELEASE_STEPS} control "
+                f"steps, not {self.deadline}"
+            )
         if self.let_go < 0.0:
             raise ValueError(f"the reward for letting go must not be negative: {self.let_go}")
 
@@ -174,7 +184,7 @@ def advance(view: View, memory: Memory) -> Advance:
     free = away & ~touched
     released = memory["released"] | free
     lost = held & ((apart > REACH**2) | (angle > MAX_TILT))
-    clinging = (clock >= RELEASE_STEPS) & ~free
+    clinging = (clock >= view.config.deadline) & ~free
 
     furthest = view.geometry.marks(physics.body_pos[:, 0], view.rotation[:, 0], TOUCH).furthest
     touches_beyond = view.touching()[:, 0] & (physics.body_pos[:, 0, :, 0] >= LINE_X)

@@ -203,6 +203,17 @@ def test_the_hand_must_be_off_the_whole_shaft_at_one_and_a_half_seconds(away, ne
         assert not step.success[0]
 
 
+def test_a_training_may_ask_for_an_earlier_release_but_not_for_a_later_one():
+    for clock, over in ((43, False), (44, True)):
+        world = Throw(deadline=44)
+        world.javelin(tuple(world.palm().tolist()))
+        world.at(clock)
+        assert ended(world.step(touched=20.0)) is over
+    for deadline in (36, 49):
+        with pytest.raises(ValueError, match="deadline must be above 36 and at most 48"):
+            Throw(deadline=deadline)
+
+
 def test_what_the_athlete_still_touches_is_not_released():
     world = Throw()
     world.javelin(FAR)  # on the head, say
