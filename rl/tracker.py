@@ -47,6 +47,9 @@ class TrackingConfig:
 
     split: Literal["train", "held_out", "all"] = "train"
     """Clips of the library to train on; held-out ones are a tenth, by the hash of their names."""
+    action: Literal["residual", "absolute"] = "residual"
+    """residual moves the PD targets around the reference's pose; absolute are PD targets as in any
+    other task, which is how a student of the tracker acts."""
     residual: float = 0.8
     """Radians by which an action of 1 moves a target off the reference's joint angle."""
     tolerance: tuple[float, float] = (0.5, 0.25)
@@ -256,7 +259,7 @@ class Tracking:
             features=self.features,
             advance=self.advance,
             promote=self.promote,
-            targets=self.targets,
+            targets=self.targets if self.config.action == "residual" else None,
             metrics={
                 "success": "fraction",
                 "mpjpe": "mm",
