@@ -28,6 +28,7 @@ class Student:
             **prior.card,
             "task": "tracking",
             "algo": "latent student",
+            "sha256": prior.digest,
             "config": {"options": options},
         }
 
