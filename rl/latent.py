@@ -23,6 +23,7 @@ from rl.policy import Policy
 from rl.prior import FORMAT, LatentNets, Shape, body_digest, check_layout, self_layout
 from rl.rollout import Rollout
 from rl.tracker import TrackingEnv
+from rl.tracking_terms import nearest_turn
 
 
 @dataclass(frozen=True)
@@ -129,9 +130,13 @@ class FrozenNormalizer:
 
 def absolute_action(env: TrackingEnv, residual: Tensor) -> Tensor:
     """(N, n) actions around the reference, clipped as the tracker's task does -> the actions
-    (N, n) of any task that reach the same PD targets, (target - offset) / scale, unclipped."""
+    (N, n) of any task that reach the same PD targets, (target - offset) / scale, unclipped.
+
+    Where the clip's hinge angles are of another turn than the athlete's, its own count.
+    """
     limited = residual.float().clamp(-1.0, 1.0)[:, None]
     targets = env.tracking.targets(env.view, env.memory, limited)[:, 0]
+    targets, _ = nearest_turn(targets, env.physics.qpos[:, 7:])
     return (targets - env.action_offset) / env.action_scale
 
 
@@ -387,4 +392,5 @@ def options_of(options: dict[str, Any]) -> PriorConfig:
     known = {f.name for f in fields(PriorConfig)}
     if unknown := sorted(set(options) - known):
         raise ValueError(f"the distillation has no option '{unknown[0]}'")
-    return PriorConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in options.items()})
+    plain: Any = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
+    return PriorConfig(**plain)

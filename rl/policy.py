@@ -133,7 +133,7 @@ class Policy:
         it, or has the very one (in training)."""
         assert self.prior is not None
         own = self.metadata["latent"]
-        if env.layer is not None:
+        if getattr(env, "layer", None) is not None:
             if env.layer.card != own:
                 raise PolicyError(
                     "the policy acts through another latent prior, or in another way, than this "
@@ -240,7 +240,7 @@ def _with_prior(policy: Policy, folder: Path) -> Policy:
     card = policy.metadata.get("latent")
     if latent != isinstance(card, dict):
         raise PolicyError("the policy's card does not say through which latent prior it acts")
-    if latent:
+    if latent and card is not None:
         try:
             policy.prior = find_prior(str(card["prior_digest"]), (folder,))
         except (PriorError, KeyError) as error:

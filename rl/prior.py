@@ -66,8 +66,8 @@ class Shape:
     def of(card: Mapping[str, Any]) -> Shape:
         """From a card. Raises ValueError where it does not hold one."""
         try:
-            numbers = {k: card[k] for k in _SIZES}
-            hidden = {k: tuple(card["hidden"][k]) for k in _HIDDEN}
+            numbers: dict[str, Any] = {k: card[k] for k in _SIZES}
+            hidden: dict[str, Any] = {k: tuple(card["hidden"][k]) for k in _HIDDEN}
             activation = str(card["activation"])
         except (KeyError, TypeError) as error:
             raise ValueError(f"its sizes are missing ({error})") from None

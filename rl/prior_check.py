@@ -59,7 +59,6 @@ def latent_divergence(
     """(Z,) mean KL divergence (nats) of the posterior from the prior, dimension by dimension, where
     the student follows clips from frames drawn anywhere."""
     student = Student(prior)
-    limits = {name: str(prior.card.get(name, "paper")) for name in ("strength", "limits")}
     config = replace(
         TrackingConfig(), action="absolute", split="all", uniform=1.0, tolerance=(0.5, 0.5)
     )
@@ -69,8 +68,9 @@ def latent_divergence(
         num_worlds=num_worlds,
         seed=seed,
         config=config,
+        strength=str(prior.card.get("strength", "paper")),
+        limits=str(prior.card.get("limits", "paper")),
         physics_options=physics_options,
-        **limits,
     )
     try:
         student.check(env)

@@ -17,6 +17,7 @@ from torch import Tensor
 from rl.host import one_torch_thread
 from rl.motion import MotionTables
 from rl.prior import LatentPrior, body_digest, check_layout
+from rl.tracking_terms import least_turn
 from sports.env import Env
 from sports.humanoid.body import load_body
 from sports.physics import PhysicsState, make_physics
@@ -105,7 +106,7 @@ def _free(tables: MotionTables, frames: Tensor, body: str) -> Task:
     ) -> tuple[PhysicsState, Memory]:
         draw = torch.rand(len(state.qpos), generator=generator, device=frames.device)
         chosen = frames[(draw * len(frames)).long().clamp(max=len(frames) - 1)]
-        qpos, qvel = tables.state(chosen)
+        qpos, qvel = least_turn(*tables.state(chosen))
         return PhysicsState(qpos, qvel, state.mocap_pos, state.wave_phase), {}
 
     def advance(view: View, memory: Memory) -> Advance:

@@ -23,6 +23,7 @@ from rl.tracking_terms import (
     goal_features,
     residual_targets,
     tracking_errors,
+    least_turn,
     wrapped,
 )
 from sports.env import Env
@@ -145,6 +146,8 @@ class Tracking:
         else:
             frame = self.sampling.draw(worlds, generator)
         qpos, qvel = self.tables.state(frame)
+        if self.config.action == "absolute":
+            qpos, qvel = least_turn(qpos, qvel)
         return PhysicsState(qpos, qvel, state.mocap_pos, state.wave_phase), {"frame": frame}
 
     def begin(self, view: View, context: Memory) -> Memory:

@@ -191,6 +191,8 @@ class _Trainer:
             self.obs = self.env.reset()
             if policy is not None and policy.actor is not None:  # never a baseline here
                 policy.check(self.env)
+                if policy.layer is not None:
+                    raise ValueError("--init is a latent policy: give --prior as well")
                 count = policy.metadata["obs_count"]
                 self.agent.load_policy(policy.actor, policy.mean, policy.std, count)
                 critic = self.agent.load_critic(policy.extra)
