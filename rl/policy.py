@@ -250,17 +250,18 @@ def _with_prior(policy: Policy, folder: Path) -> Policy:
 
 def _build(card: dict[str, Any], weights: dict[str, Tensor], where: str) -> Policy:
     """Network and statistics from a card. Raises PolicyError naming what is wrong with it."""
+    algo = card.get("algo")
+    if isinstance(algo, str) and algo not in ALGORITHMS:
+        raise PolicyError(
+            f"the policy '{where}' is of algorithm '{algo}', which cannot be played or "
+            f"trained on here: use one of {', '.join(ALGORITHMS)}"
+        )
     for name, kind in _REQUIRED.items():
         value = card.get(name)
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if not isinstance(value, kind):
             raise PolicyError(f"the card of policy '{where}' lacks a proper '{name}'")
-    if card["algo"] not in ALGORITHMS:
-        raise PolicyError(
-            f"the policy '{where}' is of algorithm '{card['algo']}', which cannot be played or "
-            f"trained on here: use one of {', '.join(ALGORITHMS)}"
-        )
     sizes = [card["obs_size"], *card["hidden"], card["action_size"]]
     if len(sizes) > MAX_LAYERS or not all(isinstance(n, int) and 0 < n < MAX_WIDTH for n in sizes):
         raise PolicyError(f"the card of policy '{where}' has impossible layer sizes {sizes}")

@@ -347,7 +347,8 @@ def _build(card: dict[str, Any], tensors: dict[str, Tensor], where: str) -> Late
         mean, std = tensors["normalizer.mean"].float(), tensors["normalizer.std"].float()
         clip = float(card["observation_clip"])
     except (RuntimeError, KeyError, TypeError, ValueError) as error:
-        raise PriorError(f"the weights of prior '{where}' do not fit its card: {error}") from None
+        why = " ".join(str(error).split())
+        raise PriorError(f"the weights of prior '{where}' do not fit its card: {why}") from None
     size = shape.obs_size if encoder else shape.self_size
     finite = all(torch.isfinite(x).all() for x in (mean, std, *weights.values()))
     if mean.shape != (size,) or std.shape != (size,) or not finite or (std <= 0).any() or clip <= 0:

@@ -21,9 +21,9 @@ from rl.motion import MotionTables, Reference
 from rl.tracking_terms import (
     contact_mismatch,
     goal_features,
+    least_turn,
     residual_targets,
     tracking_errors,
-    least_turn,
     wrapped,
 )
 from sports.env import Env
