@@ -176,6 +176,8 @@ def test_what_cannot_be_distilled_is_refused(folder, tmp_path):
         TrainConfig(task="hurdling", tracker="x")
     with pytest.raises(ValueError, match="comes before a latent prior"):
         replace(config, prior="x")
+    with pytest.raises(ValueError, match="targets of a clip are no latents"):
+        TrainConfig(task="hurdling", prior="x", clone=2, clips=(Path("a.npz"),))
     with pytest.raises(ValueError, match="need --prior"):
         TrainConfig(task="hurdling", algo="latent")
     assert not (folder / "none").exists()
@@ -265,6 +267,7 @@ def test_an_evaluation_is_stepping_by_hand(folder, tmp_path, monkeypatch):
     monkeypatch.setenv("OLYMPICS_OPT_PRIORS", str(folder / "prior"))
     found = evaluate(path, "penalty_kick", trials=3, num_worlds=3, seed=5)
     assert found.result["algo"] == "latent"
+    assert found.result["prior_digest"] == card["latent"]["prior_digest"]
 
     policy, prior = load_policy(path, "penalty_kick"), load_prior(folder / "prior")
     env = make_env("penalty_kick", num_worlds=3, seed=5, training=False)
