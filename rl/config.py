@@ -180,16 +180,16 @@ MakeEnv = Callable[[TrainConfig, int], Any]
 
 def default_env(config: TrainConfig, seed: int) -> Env:
     """The config's task on its engine, in training mode."""
-    if config.task == PRIOR:
-        from rl.distillation import make_distillation_env
-
-        return make_distillation_env(config, seed)
     physics_options = dict(config.physics_options)
     if config.engine == "mujoco" and local_ranks() > 1:
         each = max(1, (os.cpu_count() or 1) // local_ranks())
         physics_options = {"threads": each} | physics_options
     if config.vary:
         physics_options |= {"variation": Variation(), "variation_seed": seed}
+    if config.task == PRIOR:
+        from rl.distillation import make_distillation_env
+
+        return make_distillation_env(config, seed, physics_options)
     if config.task == TRACKING:
         from rl.tracker import TrackingConfig, make_tracking_env
 

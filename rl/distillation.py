@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -115,7 +116,9 @@ def teacher_of(config: TrainConfig) -> Policy:
     return teacher
 
 
-def make_distillation_env(config: TrainConfig, seed: int) -> TrackingEnv:
+def make_distillation_env(
+    config: TrainConfig, seed: int, physics_options: dict[str, Any]
+) -> TrackingEnv:
     """Worlds for a run of the task ``prior``: the tracker's own, whose actions are absolute."""
     options = options_of(config.options)
     teacher = teacher_of(config)
@@ -134,7 +137,7 @@ def make_distillation_env(config: TrainConfig, seed: int) -> TrackingEnv:
         strength=athlete["strength"],
         limits=athlete["limits"],
         config=changed,
-        physics_options=dict(config.physics_options),
+        physics_options=physics_options,
         timestep_divisor=config.timestep_divisor,
     )
     return trouble(env, options)

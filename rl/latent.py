@@ -247,16 +247,15 @@ class Distiller:
     @torch.no_grad()
     def act(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """obs (M, D) raw, of the worlds as they are -> stored obs (M, D), the student's disturbed
-        action (M, n), the action that the teacher would take (M, n), zeros (M,).
-
-        The teacher's is clamped to what an action can reach.
-        """
+        action (M, n), the action that the teacher would take (M, n), whether one can reach its
+        targets or not, zeros (M,)."""
         stored = self.prepare(obs)
         with self._autocast():
             residual = self._teacher(stored)
             latent, _ = self.nets.posterior(stored)
             action = self.nets.decode(stored[:, : self.self_size], latent)
         label = absolute_action(self.env, residual.to(self.env.device)).to(self.device)
+        label = torch.nan_to_num(label)  # of a world that diverges, which counts for nothing
         noisy = torch.arange(len(action), device=self.device) < self.config.noisy * len(action)
         noise = torch.randn(action.shape, device=self.device, generator=self.generator)
         action = action + self.sigma * noisy[:, None] * noise
