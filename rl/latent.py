@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from rl.graph import GraphedStep
 from rl.policy import Policy
 from rl.prior import FORMAT, LatentNets, Shape, body_digest, check_layout, self_layout
+from rl.ranks import SharedGradients, SharedStep
 from rl.rollout import Rollout
 from rl.tracker import TrackingEnv
 from rl.tracking_terms import nearest_turn
@@ -213,8 +214,13 @@ class Distiller:
         self._stats = torch.zeros(3, device=self.device)
         self._divergence = torch.zeros(config.latent, device=self.device)
         self._batch: dict[str, Tensor] = {}
-        wanted = cuda_graph and cuda and self.world_size == 1
-        self._step = GraphedStep(self._minibatch, self.optimizer.zero_grad, wanted)
+        wanted = cuda_graph and cuda
+        self._step: GraphedStep | SharedStep
+        if self.world_size == 1:
+            self._step = GraphedStep(self._minibatch, self.optimizer.zero_grad, wanted)
+        else:
+            shared = SharedGradients(self.nets.parameters())
+            self._step = SharedStep(shared, self._backward, self._descend, wanted)
 
     def new_rollout(self, rows: int) -> Rollout:
         """Storage for ``rows`` worlds. Raises ValueError if they are too few for minibatches."""
@@ -324,6 +330,12 @@ class Distiller:
 
     def _minibatch(self, rows: Tensor) -> None:
         """One gradient step on all steps of worlds ``rows`` (m,)."""
+        self.optimizer.zero_grad(set_to_none=True)
+        self._backward(rows)
+        self._descend()
+
+    def _backward(self, rows: Tensor) -> None:
+        """Adds the gradients of worlds ``rows`` (m,) and their statistics."""
         c = self.config
         b = {name: x[:, rows] for name, x in self._batch.items()}
         error, divergence, moved = self.losses(b["obs"], b["label"], b["noise"])
@@ -335,23 +347,14 @@ class Distiller:
         parts = torch.stack((mean(error, weight), mean(moved, b["going"])))
         each = (weight[..., None] * divergence).sum((0, 1)) / weight.sum().clamp(min=1.0)
         loss = parts[0] + self.beta * each.sum() + c.smooth * parts[1]
-        self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        if self.world_size > 1:
-            self._average_over_ranks()
         with torch.no_grad():
             self._stats += torch.cat((loss[None], parts))
             self._divergence += each
-        nn.utils.clip_grad_norm_(self.nets.parameters(), c.grad_norm, foreach=True)
-        self.optimizer.step()
 
-    def _average_over_ranks(self) -> None:
-        grads = [p.grad for p in self.nets.parameters() if p.grad is not None]
-        flat = torch.cat([g.flatten() for g in grads])
-        dist.all_reduce(flat)
-        flat /= self.world_size
-        parts = flat.split([g.numel() for g in grads])
-        torch._foreach_copy_(grads, [p.view_as(g) for p, g in zip(parts, grads)])
+    def _descend(self) -> None:
+        nn.utils.clip_grad_norm_(self.nets.parameters(), self.config.grad_norm, foreach=True)
+        self.optimizer.step()
 
     # -- state ----------------------------------------------------------------------------------
 
