@@ -136,6 +136,36 @@ def test_killed_it_loses_little(folder):
     same_bits(run, folder / "whole")
 
 
+RANKS = """
+import sys
+from pathlib import Path
+from tests.rl.latent_made import prior_config
+from rl.train import train
+train(prior_config(Path(sys.argv[1]), "ranks", samples=2 * 4 * 8 * 4, device="cpu"))
+"""
+
+
+def test_two_ranks_learn_one_student_in_worlds_of_their_own(folder, tmp_path):
+    root, script = Path(__file__).parents[2], tmp_path / "ranks.py"
+    script.write_text(RANKS)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    command += ["--local-addr", "127.0.0.1", "--nproc-per-node", "2", str(script), str(folder)]
+    environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
+    subprocess.run(command, cwd=root, env=environment, check=True, timeout=180)
+    saved = checkpoints(folder / "ranks")[-1]
+    one, two = (load_checkpoint(saved, rank)[1] for rank in (0, 1))
+    for name, value in one.items():
+        if name.startswith(("agent/nets.", "agent/adam.")):
+            assert torch.equal(value, two[name]), name
+    assert not torch.equal(one["env/qpos"], two["env/qpos"])
+    alone = load_checkpoint(checkpoints(folder / "prior")[-1])[1]
+    assert not torch.equal(one["agent/nets.prior.head.bias"], alone["agent/nets.prior.head.bias"])
+    assert (
+        load_prior(folder / "ranks" / "prior.safetensors").digest
+        == load_prior(folder / "ranks").digest
+    )
+
+
 def test_another_teacher_or_library_is_refused_on_resume(folder, tmp_path):
     shutil.copytree(folder / "prior", tmp_path / "prior")
     shutil.copy(folder / "golf.npz", tmp_path / "golf.npz")
