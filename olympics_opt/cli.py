@@ -341,6 +341,9 @@ COMMANDS: dict[str, Command] = {
     ),
     "tracker": Command(Tracker, "olympics_opt.tracker:run_tracker"),
     "likeness": Command(Likeness, "olympics_opt.likeness:run_likeness"),
+    "prior": Command(
+        None, "olympics_opt.prior:main", summary="Check, play and export latent priors."
+    ),
     "bench": Command(
         None, "olympics_opt.bench:main", summary="Measure physics, environment and training speed."
     ),

@@ -16,6 +16,7 @@ import tyro
 from rl.amp import AMPConfig
 from rl.checkpoint import checkpoints, read_state
 from rl.host import local_ranks
+from rl.latent_action import LatentConfig
 from rl.ppo import PAPER, PPOConfig
 from sports.env import Env, Starts, make_env
 from sports.physics.variation import Variation
@@ -25,6 +26,8 @@ DEFAULT_WORLDS = {"mujoco": 256, "warp": 8192, "drake": 4}
 DEFAULT_SAMPLES = 100_000_000
 TRACKING = "tracking"
 """The task of the motion tracker. It is not in the registry: it is nothing without clips."""
+PRIOR = "prior"
+"""The distillation of the tracker into a latent prior: not a sport either."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +38,9 @@ class TrainConfig:
     """Name of the task."""
     out: Path = Path("runs/train")
     """Folder of the run."""
-    algo: Literal["ppo", "amp"] = "ppo"
-    """Learner: ppo, or amp, which also pays for moving like the ``clips``."""
+    algo: Literal["ppo", "amp", "latent", "latent-amp"] = "ppo"
+    """Learner: ppo, or amp, which also pays for moving like the ``clips``. With ``--prior`` they
+    are latent and latent-amp."""
     engine: Literal["mujoco", "warp", "drake"] = "mujoco"
     """Physics engine: mujoco needs no GPU, warp needs one, drake is for checking, not training."""
     worlds: int | None = None
@@ -71,6 +75,12 @@ class TrainConfig:
     clips: tuple[Path, ...] = ()
     """Demonstrations (npz): their frames may start episodes, and amp learns their style; for the
     task ``tracking`` the motions to follow: a packed library, or clips and folders of them."""
+    tracker: str | None = None
+    """For the task ``prior``: the motion tracker to learn from, a run or a policy file."""
+    prior: str | None = None
+    """Act through this latent prior: a run of the task ``prior``, a file, or pretrained."""
+    latent: LatentConfig = field(default_factory=LatentConfig)
+    """How, with ``--prior``."""
     start_probability: tuple[float, float] = (0.5, 0.1)
     """Share of episodes that start from a demonstration, at the beginning and end of the run."""
     imitation: float = 0.0
@@ -124,10 +134,20 @@ class TrainConfig:
             raise ValueError(f"clone must not be negative: {self.clone}")
         if self.clone and len(self.clips) != 1:
             raise ValueError("cloning needs one clip of a whole episode: give it with --clips")
-        if self.algo != "amp" and self.amp != AMPConfig():
+        if self.clone and (self.prior is not None or self.task == PRIOR):
+            raise ValueError("the targets of a clip are no latents: leave --clone or --prior out")
+        if not self.styled and self.amp != AMPConfig():
             raise ValueError("the --amp options need --algo amp")
-        if self.algo == "amp" and self.task == TRACKING:
+        if self.styled and self.task == TRACKING:
             raise ValueError("the tracker follows its clips frame by frame: leave --algo amp out")
+        if self.prior is None and (self.algo.startswith("latent") or self.latent != LatentConfig()):
+            raise ValueError("--algo latent and the --latent options need --prior")
+        if self.prior is not None and self.task in (TRACKING, PRIOR):
+            raise ValueError(f"the task '{self.task}' comes before a latent prior: leave it out")
+        if self.task not in ("", PRIOR) and self.tracker is not None:
+            raise ValueError("--tracker is for the task 'prior' alone")
+        if self.task == PRIOR and (self.algo != "ppo" or self.ppo != PPOConfig() or self.paper):
+            raise ValueError("the task 'prior' has a learner of its own: its options are --task.*")
         if self.paper and self.ppo != PPOConfig():
             raise ValueError("--paper fixes the hyper-parameters: leave the --ppo options out")
 
@@ -135,6 +155,18 @@ class TrainConfig:
     def hyper(self) -> PPOConfig:
         """The hyper-parameters in force."""
         return PAPER if self.paper else self.ppo
+
+    @property
+    def styled(self) -> bool:
+        """Whether moving like the clips is paid for."""
+        return self.algo in ("amp", "latent-amp")
+
+    @property
+    def method(self) -> str:
+        """The learner's full name, for cards."""
+        if self.prior is None:
+            return self.algo
+        return "latent-amp" if self.styled else "latent"
 
     @property
     def num_worlds(self) -> int:
@@ -154,6 +186,10 @@ def default_env(config: TrainConfig, seed: int) -> Env:
         physics_options = {"threads": each} | physics_options
     if config.vary:
         physics_options |= {"variation": Variation(), "variation_seed": seed}
+    if config.task == PRIOR:
+        from rl.distillation import make_distillation_env
+
+        return make_distillation_env(config, seed, physics_options)
     if config.task == TRACKING:
         from rl.tracker import TrackingConfig, make_tracking_env
 
@@ -184,6 +220,10 @@ def default_env(config: TrainConfig, seed: int) -> Env:
 
 def task_options(task: str) -> type:
     """The options' dataclass of a task. Raises ValueError for an unknown one."""
+    if task == PRIOR:
+        from rl.latent import PriorConfig
+
+        return PriorConfig
     if task == TRACKING:
         from rl.tracker import TrackingConfig
 
@@ -255,7 +295,7 @@ def _same_options(task: str, given: dict[str, Any], own: dict[str, Any]) -> None
     The command line gives every option of the task, asked for or not, so that one at its default
     asks for nothing; lists are what JSON made of the run's tuples.
     """
-    known = (*task_names(), TRACKING)
+    known = (*task_names(), TRACKING, PRIOR)
     plain = dataclasses.asdict(task_options(task)()) if task in known else {}
     for name, value in given.items():
         asked = json.loads(json.dumps(value))
@@ -279,7 +319,9 @@ def config_from_dict(data: dict[str, Any]) -> TrainConfig:
         data["out"] = Path(data["out"])
         data["clips"] = tuple(Path(p) for p in data["clips"])
         data["start_probability"] = tuple(data["start_probability"])
-        return TrainConfig(**data, ppo=PPOConfig(**ppo), amp=AMPConfig(**amp))
+        latent = LatentConfig(**data.pop("latent", {}))
+        how = {"ppo": PPOConfig(**ppo), "amp": AMPConfig(**amp), "latent": latent}
+        return TrainConfig(**data, **how)
     except (TypeError, KeyError) as error:
         raise ValueError(f"the run's settings cannot be read ({error})") from error
 
@@ -289,10 +331,10 @@ def parse_args(args: list[str], prog: str = "python -m rl.train") -> TrainConfig
 
     Raises ValueError for an unknown task; exits with code 2 and a message for other mistakes.
     """
+    known = ", ".join((*task_names(), TRACKING, PRIOR))
     if not args or args[0].startswith("-"):
         if not {"-h", "--help"} & set(args):
-            raise ValueError(f"say which task to train: {', '.join((*task_names(), TRACKING))}")
-        known = ", ".join((*task_names(), TRACKING))
+            raise ValueError(f"say which task to train: {known}")
         print(f"usage: {prog} TASK [options], TASK one of {known}\n")
         tyro.cli(TrainConfig, args=args, prog=f"{prog} TASK")
     name, options_type = args[0], task_options(args[0])

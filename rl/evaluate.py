@@ -203,6 +203,8 @@ def evaluate(
         "overflow": sum(p.overflow for p in played),
         "nan_worlds": sum(p.nan_worlds for p in played),
     }
+    if policy.prior is not None:
+        result["prior_digest"] = policy.prior.digest
     for recording in recordings.values():
         recording.meta |= {"policy_sha256": card["sha256"], "commit": result["commit"]}
     return EvaluationResult(result, values, recordings)

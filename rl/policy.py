@@ -20,13 +20,16 @@ from torch import Tensor
 
 from rl import pretrained
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
+from rl.latent_action import LatentActions, LatentConfig
 from rl.networks import MLP
+from rl.prior import LatentPrior, PriorError, find_prior
 from warmstart.atomic import write_bytes, write_text
 
 FORMAT = "olympics-opt policy 1"
 BASELINES = ("zero", "random")
-ALGORITHMS = ("ppo", "amp")
-"""Those whose actor turns an observation into PD targets, which is what a policy is here."""
+ALGORITHMS = ("ppo", "amp", "latent", "latent-amp")
+"""Those whose actor turns an observation into PD targets, which is what a policy is here, or into
+latents of a prior (``latent``), which it is told of by its card."""
 MAX_WIDTH, MAX_LAYERS = 1 << 16, 32
 _REQUIRED = {
     "format": str,
@@ -68,6 +71,10 @@ class Policy:
     hardware, metrics, sha256."""
     extra: dict[str, Tensor] = field(default_factory=dict)
     """Critic state, where the source has it (a run's folder)."""
+    prior: LatentPrior | None = None
+    """Of a latent policy."""
+    layer: LatentActions | None = None
+    """Makes actions of its latents, unless the environment does; ``check`` sets it."""
     _random: torch.Generator | None = None
     _noise_seed: int = 0
 
@@ -82,12 +89,15 @@ class Policy:
                 self._random = torch.Generator(obs.device).manual_seed(self._noise_seed)
             return 2.0 * torch.rand(shape, device=obs.device, generator=self._random) - 1.0
         clip = self.metadata["observation_clip"]
-        return self.actor(((torch.nan_to_num(obs) - self.mean) / self.std).clamp(-clip, clip))
+        action = self.actor(((torch.nan_to_num(obs) - self.mean) / self.std).clamp(-clip, clip))
+        return action if self.layer is None else self.layer(obs, action)
 
     def to(self, device: torch.device | str) -> Policy:
         """The same policy on a device (moved in place)."""
         if self.actor is not None:
             self.actor.to(device)
+        if self.prior is not None:
+            self.prior.to(device)
         self.mean, self.std = self.mean.to(device), self.std.to(device)
         return self
 
@@ -96,12 +106,16 @@ class Policy:
         self._noise_seed, self._random = seed, None
 
     def check(self, env: Any) -> None:
-        """Raises PolicyError where the policy does not fit an environment."""
+        """Raises PolicyError where the policy does not fit an environment.
+
+        A latent policy learns here what its latents mean to the environment's athlete.
+        """
         m = self.metadata
         if self.actor is None:
             m["action_size"] = env.action_size
             return
-        for name, have in (("obs_size", env.obs_size), ("action_size", env.action_size)):
+        size = env.action_size if self.prior is None else self._check_latent(env)
+        for name, have in (("obs_size", env.obs_size), ("action_size", size)):
             if m[name] != have:
                 raise PolicyError(
                     f"the policy has {name} {m[name]}, but task '{env.task.name}' with these "
@@ -113,6 +127,27 @@ class Policy:
                 f"the policy was trained on another layout of the observations of "
                 f"'{env.task.name}': train it again with this version"
             )
+
+    def _check_latent(self, env: Any) -> int:
+        """Numbers of the action of a latent policy in an environment, which gets a layer to play
+        it, or has the very one (in training)."""
+        assert self.prior is not None
+        own = self.metadata["latent"]
+        if getattr(env, "layer", None) is not None:
+            if env.layer.card != own:
+                raise PolicyError(
+                    "the policy acts through another latent prior, or in another way, than this "
+                    "run: give the run the prior and the --latent options of the policy"
+                )
+            return env.layer.size
+        scene = env.physics.scene
+        try:
+            config = LatentConfig(**{k: v for k, v in own.items() if k != "prior_digest"})
+            self.layer = LatentActions(self.prior, config, scene, env.task.tools, env.device)
+            self.layer.check(env.obs_slices)
+        except (ValueError, TypeError) as error:
+            raise PolicyError(f"the policy's latents mean nothing here: {error}") from error
+        return self.layer.size
 
 
 def load_policy(source: str | Path, task: str) -> Policy:
@@ -169,7 +204,7 @@ def _from_run(run: Path) -> Policy:
         for k, v in tensors.items()
         if k.startswith(("agent/critic.", "agent/value_norm."))
     }
-    return policy
+    return _with_prior(policy, run)
 
 
 def _from_file(path: Path) -> Policy:
@@ -195,22 +230,38 @@ def _from_file(path: Path) -> Policy:
     actor = {k: v.float() for k, v in weights.items() if k not in extra}
     policy = _build(card, actor, str(path))
     policy.extra = {k: v.float() if k.startswith("critic.") else v for k, v in extra.items()}
+    return _with_prior(policy, path.parent)
+
+
+def _with_prior(policy: Policy, folder: Path) -> Policy:
+    """The policy with its latent prior, from its own folder or where priors are. Raises PolicyError
+    where there is none."""
+    latent = policy.metadata["algo"].startswith("latent")
+    card = policy.metadata.get("latent")
+    if latent != isinstance(card, dict):
+        raise PolicyError("the policy's card does not say through which latent prior it acts")
+    if latent and card is not None:
+        try:
+            policy.prior = find_prior(str(card["prior_digest"]), (folder,))
+        except (PriorError, KeyError) as error:
+            raise PolicyError(str(error)) from error
     return policy
 
 
 def _build(card: dict[str, Any], weights: dict[str, Tensor], where: str) -> Policy:
     """Network and statistics from a card. Raises PolicyError naming what is wrong with it."""
+    algo = card.get("algo")
+    if isinstance(algo, str) and algo not in ALGORITHMS:
+        raise PolicyError(
+            f"the policy '{where}' is of algorithm '{algo}', which cannot be played or "
+            f"trained on here: use one of {', '.join(ALGORITHMS)}"
+        )
     for name, kind in _REQUIRED.items():
         value = card.get(name)
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if not isinstance(value, kind):
             raise PolicyError(f"the card of policy '{where}' lacks a proper '{name}'")
-    if card["algo"] not in ALGORITHMS:
-        raise PolicyError(
-            f"the policy '{where}' is of algorithm '{card['algo']}', which cannot be played or "
-            f"trained on here: use one of {', '.join(ALGORITHMS)}"
-        )
     sizes = [card["obs_size"], *card["hidden"], card["action_size"]]
     if len(sizes) > MAX_LAYERS or not all(isinstance(n, int) and 0 < n < MAX_WIDTH for n in sizes):
         raise PolicyError(f"the card of policy '{where}' has impossible layer sizes {sizes}")
@@ -234,8 +285,9 @@ def _portable(config: dict[str, Any]) -> dict[str, Any]:
     config = {k: v for k, v in config.items() if k not in ("out", "resume", "quiet", "device")}
     if isinstance(config.get("clips"), list):
         config["clips"] = [Path(p).name for p in config["clips"]]
-    if config.get("init"):
-        config["init"] = Path(config["init"]).name
+    for name in ("init", "prior", "tracker"):
+        if config.get(name):
+            config[name] = Path(config[name]).name
     return config
 
 

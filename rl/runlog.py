@@ -114,7 +114,9 @@ _SHOWN = (
     "samples_per_s",
     "return",
     "episode_steps",
+    "action_error",
     "kl",
+    "active",
     "learning_rate",
     "sigma",
 )
@@ -122,7 +124,7 @@ _SHOWN = (
 
 def _line(row: Row, share: float) -> str:
     words = [f"{share:4.0%}", f"iteration {row['iteration']}"]
-    words += [f"{name} {_text(row.get(name))}" for name in _SHOWN]
+    words += [f"{name} {_text(row[name])}" for name in _SHOWN if name in row]
     words += [f"{k[8:]} {_text(v)}" for k, v in row.items() if k.startswith("metrics/")]
     return " | ".join(words)
 
@@ -135,7 +137,7 @@ def _panel(row: Row, share: float) -> Any:
 
     def table(title: str, names: list[str]) -> Table:
         grid = Table(title=title, title_justify="left", show_header=False, box=None)
-        for name in names:
+        for name in (n for n in names if n in row):
             grid.add_row(name.partition("/")[2] or name, _text(row.get(name)))
         return grid
 

@@ -21,6 +21,7 @@ from rl.motion import MotionTables, Reference
 from rl.tracking_terms import (
     contact_mismatch,
     goal_features,
+    least_turn,
     residual_targets,
     tracking_errors,
     wrapped,
@@ -47,6 +48,9 @@ class TrackingConfig:
 
     split: Literal["train", "held_out", "all"] = "train"
     """Clips of the library to train on; held-out ones are a tenth, by the hash of their names."""
+    action: Literal["residual", "absolute"] = "residual"
+    """residual moves the PD targets around the reference's pose; absolute are PD targets as in any
+    other task, which is how a student of the tracker acts."""
     residual: float = 0.8
     """Radians by which an action of 1 moves a target off the reference's joint angle."""
     tolerance: tuple[float, float] = (0.5, 0.25)
@@ -142,6 +146,8 @@ class Tracking:
         else:
             frame = self.sampling.draw(worlds, generator)
         qpos, qvel = self.tables.state(frame)
+        if self.config.action == "absolute":
+            qpos, qvel = least_turn(qpos, qvel)
         return PhysicsState(qpos, qvel, state.mocap_pos, state.wave_phase), {"frame": frame}
 
     def begin(self, view: View, context: Memory) -> Memory:
@@ -256,7 +262,7 @@ class Tracking:
             features=self.features,
             advance=self.advance,
             promote=self.promote,
-            targets=self.targets,
+            targets=self.targets if self.config.action == "residual" else None,
             metrics={
                 "success": "fraction",
                 "mpjpe": "mm",

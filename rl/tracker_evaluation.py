@@ -21,6 +21,7 @@ from rl.config import TRACKING
 from rl.evaluate import interval
 from rl.host import one_torch_thread
 from rl.policy import Policy, PolicyError, load_policy
+from rl.student import Student
 from rl.tracker import TrackingConfig, TrackingEnv, make_tracking_env
 from warmstart.library import Library, Origin
 
@@ -38,7 +39,7 @@ ASK = 10
 
 
 def evaluate_tracker(
-    policy: Policy | str | Path,
+    policy: Policy | Student | str | Path,
     library: Library,
     *,
     engine: str = "mujoco",
@@ -52,8 +53,8 @@ def evaluate_tracker(
     """Plays every clip of a library once; JSON with the figures and what decides them.
 
     Args:
-        policy: a loaded policy, or what ``load_policy`` accepts; ``zero`` plays the reference's
-            poses as PD targets.
+        policy: a loaded policy, a student of one, or what ``load_policy`` accepts; ``zero`` plays
+            the reference's poses as PD targets.
         library: clips of both splits or of one.
         engine: ``mujoco``, ``warp`` or ``drake``.
         num_worlds: worlds at once; None for the engine's default.
@@ -65,10 +66,10 @@ def evaluate_tracker(
 
     Raises PolicyError for a policy that does not fit, ValueError for clips of another body.
     """
-    if not isinstance(policy, Policy):
+    if isinstance(policy, (str, Path)):
         policy = load_policy(policy, TRACKING)
     card = policy.metadata
-    config = _config(card)
+    config = tracking_config(card)
     clips = len(library.lengths)
     worlds = min(num_worlds or DEFAULT_WORLDS.get(engine, 64), clips)
     order = np.argsort(library.lengths, kind="stable").tolist()
@@ -150,7 +151,7 @@ def _figures(rows: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _play(policy: Policy, env: TrackingEnv, clips: list[int]) -> np.ndarray:
+def _play(policy: Policy | Student, env: TrackingEnv, clips: list[int]) -> np.ndarray:
     """(N, 5) figures of the first episode of each world."""
     env.assign(clips)
     obs = env.reset()
@@ -180,7 +181,7 @@ def _padded(clips: list[int], worlds: int) -> list[int]:
     return clips + [clips[-1]] * (worlds - len(clips))
 
 
-def _config(card: dict[str, Any]) -> TrackingConfig:
+def tracking_config(card: dict[str, Any]) -> TrackingConfig:
     """The options that a policy was trained with; the defaults for a baseline."""
     options = card.get("config", {}).get("options", {})
     try:

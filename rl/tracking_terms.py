@@ -70,3 +70,30 @@ def residual_targets(qpos: Tensor, reference: Tensor, action: Tensor, scale: flo
     """PD targets (rad): the reference's angle, on the turn that a hinge is in, plus ``scale``
     times the action. All (..., n)."""
     return qpos + wrapped(reference - qpos) + scale * action
+
+
+def nearest_turn(angle: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+    """Hinge angles (..., n) of the same rotations of all joints, nearest to ``near`` (..., n), and
+    (..., n / 3) bool, whether a joint's are of the other kind.
+
+    Rx(a) Ry(b) Rz(c) = Rx(a + pi) Ry(pi - b) Rz(c + pi): every rotation has two triples of hinge
+    angles, up to whole turns. Servos do the same in either, b's in the mirror.
+    """
+    own, near = angle.unflatten(-1, (-1, 3)), near.unflatten(-1, (-1, 3))
+    a, b, c = own.unbind(-1)
+    other = torch.stack((a + math.pi, math.pi - b, c + math.pi), -1)
+    turn = 2.0 * math.pi
+    pair = [x + turn * torch.round((near - x) / turn) for x in (own, other)]
+    far, far_other = ((x - near).square().sum(-1) for x in pair)
+    flipped = far_other < far
+    return torch.where(flipped[..., None], pair[1], pair[0]).flatten(-2), flipped
+
+
+def least_turn(qpos: Tensor, qvel: Tensor) -> tuple[Tensor, Tensor]:
+    """The same states (..., 7 + n), (..., 6 + n) with the hinge angles nearest to zero: an action
+    reaches no other turn, and nobody can see in which one a hinge is."""
+    angle, flipped = nearest_turn(qpos[..., 7:], torch.zeros_like(qpos[..., 7:]))
+    rates = qvel[..., 6:].unflatten(-1, (-1, 3))
+    x, y, z = rates.unbind(-1)
+    rates = torch.stack((x, torch.where(flipped, -y, y), z), -1).flatten(-2)
+    return torch.cat((qpos[..., :7], angle), -1), torch.cat((qvel[..., :6], rates), -1)

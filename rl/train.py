@@ -21,7 +21,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from rl import amp, provenance
+from rl import amp, latent_run, provenance
 from rl.checkpoint import (
     CheckpointError,
     checkpoints,
@@ -33,6 +33,7 @@ from rl.cloning import STATISTIC as CLONE_ERROR
 from rl.cloning import Cloning
 from rl.config import (
     DEFAULT_SAMPLES,
+    PRIOR,
     TRACKING,
     MakeEnv,
     TrainConfig,
@@ -152,8 +153,8 @@ class _Trainer:
             config = replace(config, ppo=replace(config.ppo, **shape))
         self.config, self.hyper = config, config.hyper
         self.env = environment(config, config.seed + 7919 * self.rank)
-        if starts is None and config.clips and config.task != TRACKING:
-            load = load_placed_starts if config.algo == "amp" else load_starts
+        if starts is None and config.clips and config.task not in (TRACKING, PRIOR):
+            load = load_placed_starts if config.styled else load_starts
             starts = load(config.clips, config.start_probability[0])
         if starts is not None:
             self.env.starts = starts.to(self.env.device)
@@ -165,20 +166,14 @@ class _Trainer:
         self.bonuses: list[Callable[[Any], Tensor]] = [self.imitation] if self.imitation else []
         if config.impact > 0.0:
             self.bonuses.append(ImpactCost(self.env, config.impact, config.impact_limit))
+        if config.prior is not None:
+            latent_run.act_through_prior(self.env, config)
         rows = self.env.num_worlds * self.env.num_agents
-        self.agent = PPO(
-            self.env.obs_size,
-            self.env.action_size,
-            self.hyper,
-            self.device,
-            config.seed,
-            config.cuda_graph,
-            {"auto": None, "float32": False, "bfloat16": True}[config.precision],
-        )
+        self.agent = self._learner()
         self.rollout = self.agent.new_rollout(rows)
         self.meter = EpisodeMeter(self.env)
         self.style: amp.AMP | None = None
-        if config.algo == "amp":
+        if config.styled:
             device, how = self.device, (config.seed, config.cuda_graph, self.agent.bf16)
             self.style = amp.of_athletes(
                 self.env, config.clips, self.hyper.steps, config.amp, device, *how
@@ -186,7 +181,7 @@ class _Trainer:
         self.cloning: Cloning | None = None
         if config.clone > 0:
             self.cloning = Cloning(self.env, self.agent, Clip.load(config.clips[0]), config.clone)
-        self.samples_each = self.hyper.steps * rows * self.ranks
+        self.samples_each = self.rollout.steps * rows * self.ranks
         self.iteration, self.samples, self.minutes = 0, 0, 0.0
         self.metrics: dict[str, float] = {}
         self.warmup = 0
@@ -196,12 +191,22 @@ class _Trainer:
             self.obs = self.env.reset()
             if policy is not None and policy.actor is not None:  # never a baseline here
                 policy.check(self.env)
+                if policy.layer is not None:
+                    raise ValueError("--init is a latent policy: give --prior as well")
                 count = policy.metadata["obs_count"]
                 self.agent.load_policy(policy.actor, policy.mean, policy.std, count)
                 critic = self.agent.load_critic(policy.extra)
                 self.warmup = 0 if critic else self.hyper.critic_warmup
         # Without any statistics the first rollout is for the observation normaliser only.
-        self.first_learning = 0 if config.init else 1
+        self.first_learning = 0 if config.init or config.task == PRIOR else 1
+
+    def _learner(self) -> Any:
+        c = self.config
+        bf16 = {"auto": None, "float32": False, "bfloat16": True}[c.precision]
+        if c.task == PRIOR:
+            return latent_run.make_distiller(c, self.env, self.device, bf16)
+        sizes = (self.env.obs_size, self.env.action_size)
+        return PPO(*sizes, self.hyper, self.device, c.seed, c.cuda_graph, bf16)
 
     def _watch(self, result: Any) -> None:
         self.meter(result)
@@ -253,6 +258,8 @@ class _Trainer:
                         if due or (every is not None and self.iteration % every == 0):
                             saved, last_saved = self._save(), self.minutes
                 saved = saved or self._save()
+                if config.task == PRIOR and self.rank == 0:
+                    latent_run.write_prior(config.out)
         except OSError as error:
             raise CheckpointError(
                 f"the run could not write to {config.out} ({error.strerror or error}): free some "
@@ -334,7 +341,7 @@ class _Trainer:
             "samples_per_s": self.samples_each / took,
             "rollout_s": rollout_s,
             "update_s": update_s,
-            **dict.fromkeys(STATISTICS),
+            **dict.fromkeys(STATISTICS if self.config.task != PRIOR else ()),
             **dict.fromkeys(amp.STATISTICS if self.style is not None else ()),
             **dict.fromkeys((CLONE_ERROR,) if self.cloning is not None else ()),
             **losses_now,
@@ -389,6 +396,8 @@ class _Trainer:
 
     def _schedule(self, share: float) -> None:
         c, h = self.config, self.hyper
+        if c.task == PRIOR:
+            self.agent.schedule(share)
         if h.sigma_final is not None:
             self.agent.sigma.fill_(h.sigma * (h.sigma_final / h.sigma) ** share)
         resting = self.iteration < max(self.warmup, c.clone)  # only the critic learns by reward
@@ -408,6 +417,8 @@ class _Trainer:
     def _write_config(self) -> None:
         c = self.config
         c.out.mkdir(parents=True, exist_ok=True)
+        if c.prior is not None:
+            latent_run.keep_prior(self.env, c.out)
         data = {
             "config": dataclasses.asdict(replace(c, ppo=self.hyper, paper=False)),
             "paper": c.paper,
@@ -425,7 +436,7 @@ class _Trainer:
         return {
             "format": POLICY_FORMAT,
             "task": c.task,
-            "algo": c.algo,
+            "algo": c.method,
             "body": getattr(task, "body", "none"),
             "strength": c.strength,
             "limits": c.limits,
@@ -446,6 +457,7 @@ class _Trainer:
             "versions": provenance.versions(),
             "metrics": dict(self.metrics),
             **getattr(self.env, "card", {}),
+            **latent_run.card(self.env, self.agent),
         }
 
     def _save(self) -> Path:

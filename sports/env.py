@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import torch
 from torch import Tensor
@@ -60,6 +60,17 @@ class StepResult:
         return (self.terminated | self.truncated).any(-1)
 
 
+class ActionLayer(Protocol):
+    """What may stand between a policy's action and the athlete's, such as a decoder of latents."""
+
+    size: int
+    """Numbers in the policy's action."""
+
+    def __call__(self, obs: Tensor, action: Tensor, /) -> Tensor:
+        """(N, A, obs) as last shown, (N, A, size) -> (N, A, act) actions of the task."""
+        ...
+
+
 class Env:
     """N worlds of one task on one engine. Use :func:`make_env`."""
 
@@ -85,6 +96,8 @@ class Env:
         self.generator.manual_seed(seed)
         body = scene.body
         self.action_size = body.num_dofs
+        self.layer: ActionLayer | None = None
+        """Makes the athlete's actions of those that ``step`` takes; see ``act_through``."""
         self.action_scale = torch.tensor(
             body.action_scale(), dtype=torch.float32, device=self.device
         )
@@ -115,6 +128,7 @@ class Env:
         """State before the automatic reset of the last step, filled if ``keep_snapshot``."""
         self.keep_snapshot = False
         self.obs_slices: dict[str, slice] = {}
+        self._shown = torch.zeros(0, device=self.device)
         obs = self.reset()
         self.obs_size = obs.shape[-1]
 
@@ -122,6 +136,12 @@ class Env:
     def curriculum(self) -> Memory:
         """Curriculum state by name, (N,) tensors; empty for a task without one."""
         return self.view.curriculum
+
+    def act_through(self, layer: ActionLayer | None) -> None:
+        """From now on ``step`` takes the layer's actions, ``action_size`` says how many; None for
+        the athlete's own."""
+        self.layer = layer
+        self.action_size = self.physics.scene.body.num_dofs if layer is None else layer.size
 
     def reset(self) -> Tensor:
         """Resets every world; (N, A, obs)."""
@@ -132,10 +152,11 @@ class Env:
             # Once, so that worlds do not all reach the time limit together.
             draw = torch.rand(self.num_worlds, device=self.device, generator=self.generator)
             self.age = (draw * self.max_steps).long()
-        return self._observe()
+        self._shown = self._observe()
+        return self._shown
 
     def step(self, action: Tensor) -> StepResult:
-        """One control step of (N, A, act) actions in [-1, 1] (clipped here).
+        """One control step of (N, A, act) actions in [-1, 1] (clipped here), or of a layer's.
 
         Raises ValueError for an action of another shape and, on a CPU, for one that is not finite.
         On a GPU, which is not waited for, the worlds of such an action diverge (``valid``).
@@ -149,7 +170,11 @@ class Env:
             worlds = (~action.isfinite()).flatten(1).any(1).nonzero()[:, 0].tolist()
             raise ValueError(f"the action is not finite in {len(worlds)} worlds: {worlds[:8]}")
         with no_autograd() if self._stocks else contextlib.nullcontext():
-            return self._step(action)
+            if self.layer is not None:
+                action = self.layer(self._shown, action)
+            result = self._step(action)
+        self._shown = result.obs
+        return result
 
     def targets(self, action: Tensor) -> Tensor:
         """(..., act) PD targets (rad) of actions (..., act), which are clipped to [-1, 1]; of a
@@ -341,7 +366,8 @@ class Env:
         self.generator.set_state(moved["generator"].cpu())
         self.view.curriculum = {k[11:]: v for k, v in moved.items() if k.startswith("curriculum/")}
         self.view.refresh()
-        return self._observe()
+        self._shown = self._observe()
+        return self._shown
 
     def _load_stock(self, state: dict[str, Tensor]) -> None:
         """Works the stock of :meth:`state_dict` out again."""

@@ -13,6 +13,8 @@ def available() -> list[dict[str, Any]]:
     """What is shipped: one dict per policy with task, algo, strength and path, sorted."""
     found = []
     for path in sorted(FOLDER.glob("*/*.safetensors")):
+        if path.parent.name == "prior":  # no policy, but what latent ones act through
+            continue
         algo, _, strength = path.stem.rpartition("-")
         found.append(
             {"task": path.parent.name, "algo": algo, "strength": strength, "path": str(path)}

@@ -251,8 +251,8 @@ def test_what_a_run_says(tmp_path):
     with pytest.raises(ValueError, match="algo 'amp' differs from the run's 'ppo'"):
         train(dataclasses.replace(fine, algo="amp", resume=True))
     card_path = file.with_suffix(".json")
-    card_path.write_text(json.dumps({**json.loads(card_path.read_text()), "algo": "latent"}))
-    with pytest.raises(PolicyError, match="of algorithm 'latent', which cannot be played"):
+    card_path.write_text(json.dumps({**json.loads(card_path.read_text()), "algo": "distillation"}))
+    with pytest.raises(PolicyError, match="of algorithm 'distillation', which cannot be played"):
         load_policy(file, "long_jump")
 
 

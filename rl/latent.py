@@ -1,0 +1,398 @@
+"""The latent prior, learned from the motion tracker (PULSE; Luo et al. 2024), read top to bottom.
+
+A conditional variational autoencoder: an encoder that sees body and goal, a prior and a decoder
+that see the body alone. The student's mean action drives the worlds, disturbed, while the frozen
+tracker says at every state what it would do (DAgger; Ross et al. 2011); the student learns the
+PD targets that follow from that, in the action units of every task of the body.
+It takes the place of PPO in ``rl.train``: ``olympics-opt train prior --tracker RUN --clips ...``.
+
+Shapes: T steps, M worlds, D observation, S of it the body, Z latent, n hinges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from rl.graph import GraphedStep
+from rl.policy import Policy
+from rl.prior import FORMAT, LatentNets, Shape, body_digest, check_layout, self_layout
+from rl.ranks import SharedGradients, SharedStep
+from rl.rollout import Rollout
+from rl.tracker import TrackingEnv
+from rl.tracking_terms import nearest_turn
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """Options of the distillation."""
+
+    split: Literal["train", "held_out", "all"] = "train"
+    """Clips of the library to learn from, as of the tracker."""
+    latent: int = 32
+    """Numbers of a latent; 48 suits the athlete with fingers."""
+    encoder: tuple[int, ...] = (1024, 512)
+    """Hidden layers. Those of the paper are 1536 1024 512, and 3096 2048 1024 for the decoder; the
+    defaults are 4 M weights, enough for an hour of motion."""
+    prior: tuple[int, ...] = (512, 512)
+    """Hidden layers."""
+    decoder: tuple[int, ...] = (1024, 1024, 512)
+    """Hidden layers."""
+    beta: tuple[float, float] = (0.01, 0.001)
+    """Weight of the KL divergence (nats) of the posterior from the prior, first and last."""
+    beta_share: float = 0.7
+    """Part of the run over which beta falls, geometrically."""
+    smooth: float = 0.005
+    """Weight of |mu_t - 0.99 mu_(t-1)|."""
+    steps: int = 24
+    """Control steps per world and iteration."""
+    minibatches: int = 8
+    """Minibatches (of worlds) per epoch."""
+    epochs: int = 4
+    """Passes over the rollout per iteration."""
+    learning_rate: float = 5e-4
+    """Of Adam, at first."""
+    learning_rate_final: float = 1e-4
+    """At the end of the run, reached geometrically."""
+    grad_norm: float = 10.0
+    """Gradients are scaled down to this norm."""
+    noise: float = 0.02
+    """Standard deviation (action units, 1 = pi rad) of noise on the actions of noisy worlds."""
+    noisy: float = 0.5
+    """Share of the worlds with noise."""
+    push_seconds: float = 2.0
+    """Mean time between pushes of a world; 0 for none."""
+    push: float = 0.7
+    """Largest change of the root's velocity by a push (m/s), in each horizontal direction."""
+    fallen: float = 0.05
+    """Share of episodes that start with a fall."""
+    tolerance: float = 0.5
+    """Distance (m) of any link but the feet from the reference at which an episode ends."""
+
+    def __post_init__(self) -> None:
+        sizes = (self.latent, *self.encoder, *self.prior, *self.decoder)
+        if min(*sizes, self.steps - 1, self.minibatches, self.epochs) < 1:
+            raise ValueError("sizes, minibatches and epochs must be at least 1, steps at least 2")
+        if min(*self.beta, self.learning_rate, self.learning_rate_final, self.tolerance) <= 0.0:
+            raise ValueError("beta, learning rates and tolerance must be positive")
+        if min(self.smooth, self.noise, self.push_seconds, self.push) < 0.0:
+            raise ValueError("smooth, noise and pushes must not be negative")
+        shares = (self.noisy, self.fallen)
+        if not all(0.0 <= s <= 1.0 for s in shares) or not 0.0 < self.beta_share <= 1.0:
+            raise ValueError("noisy and fallen must lie in [0, 1], beta_share in (0, 1]")
+
+    def shape(self, obs_size: int, self_size: int, action_size: int) -> Shape:
+        """The networks' sizes for an athlete."""
+        hidden = (self.encoder, self.prior, self.decoder)
+        return Shape(obs_size, self_size, action_size, self.latent, *hidden)
+
+
+KEEP = 0.99
+"""Of a latent from step to step, in the smoothness term (PULSE)."""
+ACTIVE = 0.01
+"""Nats of mean KL divergence above which a dimension of the latent carries something."""
+STATISTICS = ("loss", "action_error", "kl", "active", "smoothness", "beta", "reach")
+"""What ``Distiller.update`` reports."""
+
+
+def gaussian_kl(mean: Tensor, logvar: Tensor, mean_p: Tensor, logvar_p: Tensor) -> Tensor:
+    """(..., Z) KL divergence (nats) of N(mean, exp logvar) from N(mean_p, exp logvar_p), float32.
+
+    0.5 (log s_p^2 - log s^2 + (s^2 + (m - m_p)^2) / s_p^2 - 1).
+    """
+    mean, logvar, mean_p, logvar_p = (x.float() for x in (mean, logvar, mean_p, logvar_p))
+    apart = (logvar.exp() + (mean - mean_p).square()) * (-logvar_p).exp()
+    return 0.5 * (logvar_p - logvar + apart - 1.0)
+
+
+def annealed(first: float, last: float, share: float) -> float:
+    """From first to last, geometrically, as ``share`` goes from 0 to 1."""
+    return first * (last / first) ** min(max(share, 0.0), 1.0)
+
+
+class FrozenNormalizer:
+    """The teacher's statistics of observations, as they are."""
+
+    def __init__(self, mean: Tensor, std: Tensor, clip: float, count: float) -> None:
+        self.mean, self.std, self.clip = mean.clone(), std.clone(), clip
+        self.count = count
+
+    def normalize(self, x: Tensor) -> Tensor:
+        """(..., D) -> (..., D), clamped."""
+        return ((x - self.mean) / self.std).clamp(-self.clip, self.clip)
+
+    def commit(self) -> None:
+        """Nothing: it does not learn."""
+
+
+def absolute_action(env: TrackingEnv, residual: Tensor) -> Tensor:
+    """(N, n) actions around the reference, clipped as the tracker's task does -> the actions
+    (N, n) of any task that reach the same PD targets, (target - offset) / scale, unclipped.
+
+    Where the clip's hinge angles are of another turn than the athlete's, its own count.
+    """
+    limited = residual.float().clamp(-1.0, 1.0)[:, None]
+    targets = env.tracking.targets(env.view, env.memory, limited)[:, 0]
+    targets, _ = nearest_turn(targets, env.physics.qpos[:, 7:])
+    return (targets - env.action_offset) / env.action_scale
+
+
+class Distiller:
+    """The student, its optimiser, and the teacher that labels what it sees."""
+
+    def __init__(
+        self,
+        env: TrackingEnv,
+        teacher: Policy,
+        config: PriorConfig,
+        device: torch.device | str = "cpu",
+        seed: int = 0,
+        cuda_graph: bool = True,
+        bf16: bool | None = None,
+    ) -> None:
+        """Args:
+        env: worlds of ``rl.distillation``, with absolute PD targets for actions.
+        teacher: a tracker.
+        config: see PriorConfig.
+        device: where networks and rollouts live.
+        seed: of the first weights (equal on all ranks) and of the noise (mixed with the rank).
+        cuda_graph: replay the minibatch step as a graph where that is possible.
+        bf16: multiply in bf16; None for on a GPU only.
+
+        Raises PolicyError for a teacher that does not fit, PriorError for observations that do
+        not begin with the athlete's own body.
+        """
+        teacher.check(env)
+        assert teacher.actor is not None
+        self.env, self.config, self.device = env, config, torch.device(device)
+        body = env.physics.scene.body
+        layout = self_layout(body.num_links)
+        check_layout(layout, env.obs_slices)
+        self.self_size = layout["body_angvel"][1]
+        teacher.to(self.device)
+        self._teacher = teacher.actor
+        clip, count = (teacher.metadata[k] for k in ("observation_clip", "obs_count"))
+        self.obs_norm = FrozenNormalizer(teacher.mean, teacher.std, clip, count)
+        weights = torch.Generator().manual_seed(seed)
+        shape = config.shape(env.obs_size, self.self_size, env.action_size)
+        self.nets = LatentNets(shape, weights).to(self.device)
+        self.card: dict[str, Any] = {
+            "format": FORMAT,
+            "algo": "distillation",
+            **shape.card(),
+            "layout": layout,
+            "body_digest": body_digest(body),
+            "strength": body.strength,
+            "limits": body.limits,
+            "teacher": {
+                k: teacher.metadata.get(k) for k in ("sha256", "samples", "library", "commit")
+            },
+        }
+        """What a prior says about itself, beside what every run says."""
+        self.world_size = dist.get_world_size() if dist.is_initialized() else 1
+        rank = dist.get_rank() if dist.is_initialized() else 0
+        self.generator = torch.Generator(self.device).manual_seed(seed + 1 + 1_000_003 * rank)
+
+        def scalar(value: float) -> Tensor:
+            return torch.tensor(value, dtype=torch.float32, device=self.device)
+
+        self.learning_rate, self.beta = scalar(config.learning_rate), scalar(config.beta[0])
+        self.sigma = scalar(config.noise)
+        """Of the noise on actions."""
+        self.actor_weight = scalar(1.0)
+        """Of no meaning here; the loop sets it."""
+        cuda = self.device.type == "cuda"
+        self.bf16 = cuda if bf16 is None else bf16
+        self.obs_dtype = torch.bfloat16 if cuda and self.bf16 else torch.float32
+        self.optimizer = torch.optim.Adam(
+            self.nets.parameters(), lr=self.learning_rate, fused=True, capturable=cuda
+        )
+        self._stats = torch.zeros(3, device=self.device)
+        self._divergence = torch.zeros(config.latent, device=self.device)
+        self._batch: dict[str, Tensor] = {}
+        wanted = cuda_graph and cuda
+        self._step: GraphedStep | SharedStep
+        if self.world_size == 1:
+            self._step = GraphedStep(self._minibatch, self.optimizer.zero_grad, wanted)
+        else:
+            shared = SharedGradients(self.nets.parameters())
+            self._step = SharedStep(shared, self._backward, self._descend, wanted)
+
+    def new_rollout(self, rows: int) -> Rollout:
+        """Storage for ``rows`` worlds. Raises ValueError if they are too few for minibatches."""
+        c, shape = self.config, self.nets.shape
+        if rows < c.minibatches:
+            raise ValueError(
+                f"{rows} worlds cannot be cut into {c.minibatches} minibatches: use more worlds or "
+                "fewer minibatches"
+            )
+        sizes = (shape.obs_size, shape.action_size)
+        return Rollout(c.steps, rows, *sizes, self.device, self.obs_dtype)
+
+    def schedule(self, share: float) -> None:
+        """Sets beta and learning rate for the part of the run that is done."""
+        c = self.config
+        self.beta.fill_(annealed(*c.beta, share / c.beta_share))
+        self.learning_rate.fill_(annealed(c.learning_rate, c.learning_rate_final, share))
+
+    # -- acting ---------------------------------------------------------------------------------
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(
+            self.device.type, dtype=torch.bfloat16, enabled=self.bf16, cache_enabled=False
+        )
+
+    def prepare(self, obs: Tensor) -> Tensor:
+        """(M, D) raw observations -> normalised, in the storage type. NaN becomes 0."""
+        return self.obs_norm.normalize(torch.nan_to_num(obs)).to(self.obs_dtype)
+
+    @torch.no_grad()
+    def act(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """obs (M, D) raw, of the worlds as they are -> stored obs (M, D), the student's disturbed
+        action (M, n), the action that the teacher would take (M, n), whether one can reach its
+        targets or not, zeros (M,)."""
+        stored = self.prepare(obs)
+        with self._autocast():
+            residual = self._teacher(stored)
+            latent, _ = self.nets.posterior(stored)
+            action = self.nets.decode(stored[:, : self.self_size], latent)
+        label = absolute_action(self.env, residual.to(self.env.device)).to(self.device)
+        label = torch.nan_to_num(label)  # of a world that diverges, which counts for nothing
+        noisy = torch.arange(len(action), device=self.device) < self.config.noisy * len(action)
+        noise = torch.randn(action.shape, device=self.device, generator=self.generator)
+        action = action + self.sigma * noisy[:, None] * noise
+        return stored, action, label, torch.zeros(len(action), device=self.device)
+
+    # -- learning -------------------------------------------------------------------------------
+
+    def update(self, rollout: Rollout) -> dict[str, Tensor]:
+        """Learns from a rollout; the next one may overwrite it. Returns () statistics.
+
+        loss; action_error: L2 norm of the reconstructed action's error (action units); kl: nats
+        of the posterior from the prior; active: dimensions of the latent with more than ACTIVE
+        nats; smoothness; beta; reach: share of the teacher's targets that no action reaches.
+        """
+        c = self.config
+        self._prepare_batch(rollout)
+        self._stats.zero_()
+        self._divergence.zero_()
+        for _ in range(c.epochs):
+            noise = self._batch["noise"]
+            noise.normal_(generator=self.generator)
+            order = torch.randperm(rollout.rows, device=self.device, generator=self.generator)
+            for rows in order.split(rollout.rows // c.minibatches)[: c.minibatches]:
+                self._step(rows)
+        beyond = (rollout.mean.abs() > 1.0).float().mean(-1)
+        beyond = (beyond * rollout.valid).sum() / rollout.valid.sum().clamp(min=1)
+        whole = torch.cat((self._stats, self._divergence)) / (c.epochs * c.minibatches)
+        whole = torch.cat((whole, beyond[None]))
+        if self.world_size > 1:
+            dist.all_reduce(whole)
+            whole /= self.world_size
+        loss, error, smoothness = whole[:3].unbind()
+        divergence, beyond = whole[3:-1], whole[-1]
+        active = (divergence > ACTIVE).sum().float()
+        numbers = (loss, error, divergence.sum(), active, smoothness, self.beta.clone(), beyond)
+        return dict(zip(STATISTICS, numbers))
+
+    def _prepare_batch(self, r: Rollout) -> None:
+        """What every minibatch reads, (T, M, ...), always at the same addresses."""
+        if self._step.graph is not None and self._batch["obs"].data_ptr() != r.obs.data_ptr():
+            raise ValueError("the captured update reads the first rollout: fill that one again")
+        weight = r.valid.float()
+        going = weight[:-1] * weight[1:] * ~(r.terminated | r.truncated)[:-1]
+        latent = self.config.latent
+        noise = self._batch.get("noise")
+        if noise is None:
+            noise = torch.zeros(*r.obs.shape[:2], latent, device=self.device)
+            self._batch = {"obs": r.obs, "label": r.mean, "noise": noise}
+            self._batch |= {"weight": weight, "going": going}
+        else:
+            self._batch["weight"].copy_(weight)
+            self._batch["going"].copy_(going)
+
+    def losses(self, obs: Tensor, label: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(T, m, D) normalised, (T, m, n), (T, m, Z) -> error (T, m), KL divergence (T, m, Z),
+        smoothness (T - 1, m)."""
+        body = obs[..., : self.self_size]
+        with self._autocast():
+            mean, logvar = self.nets.posterior(obs)
+            mean_p, logvar_p = self.nets.expected(body)
+            action = self.nets.decode(body, mean + (0.5 * logvar).exp() * noise)
+        error = torch.linalg.vector_norm(action - label.clamp(-1.0, 1.0), dim=-1)
+        divergence = gaussian_kl(mean, logvar, mean_p, logvar_p)
+        moved = torch.linalg.vector_norm(mean[1:] - KEEP * mean[:-1], dim=-1)
+        return error, divergence, moved
+
+    def _minibatch(self, rows: Tensor) -> None:
+        """One gradient step on all steps of worlds ``rows`` (m,)."""
+        self.optimizer.zero_grad(set_to_none=True)
+        self._backward(rows)
+        self._descend()
+
+    def _backward(self, rows: Tensor) -> None:
+        """Adds the gradients of worlds ``rows`` (m,) and their statistics."""
+        c = self.config
+        b = {name: x[:, rows] for name, x in self._batch.items()}
+        error, divergence, moved = self.losses(b["obs"], b["label"], b["noise"])
+
+        def mean(x: Tensor, weight: Tensor) -> Tensor:
+            return (weight * x).sum() / weight.sum().clamp(min=1.0)
+
+        weight = b["weight"]
+        parts = torch.stack((mean(error, weight), mean(moved, b["going"])))
+        each = (weight[..., None] * divergence).sum((0, 1)) / weight.sum().clamp(min=1.0)
+        loss = parts[0] + self.beta * each.sum() + c.smooth * parts[1]
+        loss.backward()
+        with torch.no_grad():
+            self._stats += torch.cat((loss[None], parts))
+            self._divergence += each
+
+    def _descend(self) -> None:
+        nn.utils.clip_grad_norm_(self.nets.parameters(), self.config.grad_norm, foreach=True)
+        self.optimizer.step()
+
+    # -- state ----------------------------------------------------------------------------------
+
+    def _digest(self) -> Tensor:
+        return torch.tensor(list(str(self.card["teacher"]["sha256"]).encode()), dtype=torch.uint8)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that decides the next update, by name, and the normaliser."""
+        state = {f"nets.{name}": p.detach() for name, p in self.nets.named_parameters()}
+        for name, p in self.nets.named_parameters():
+            state |= {f"adam.{name}.{key}": x for key, x in self.optimizer.state[p].items()}
+        norm = {f"normalizer.{k}": getattr(self.obs_norm, k) for k in ("mean", "std")}
+        own = {"teacher": self._digest(), "generator": self.generator.get_state()}
+        return state | norm | own
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Takes a state back. Raises ValueError where it or the teacher does not fit."""
+        if "teacher" not in state or not torch.equal(state["teacher"], self._digest()):
+            raise ValueError("the run learned from another tracker: resume it with that one")
+        with torch.no_grad():
+            for name, p in self.nets.named_parameters():
+                saved = state.get(f"nets.{name}")
+                if saved is None or saved.shape != p.shape:
+                    raise ValueError(f"the checkpoint's '{name}' does not fit this network")
+                p.copy_(saved)
+                start = f"adam.{name}."
+                moments = {k: x for k, x in state.items() if k.startswith(start)}
+                if moments:
+                    self.optimizer.state[p] = {
+                        k.removeprefix(start): x.clone().to(self.device) for k, x in moments.items()
+                    }
+        self.generator.set_state(state["generator"].cpu())
+
+
+def options_of(options: dict[str, Any]) -> PriorConfig:
+    """A PriorConfig from the options of a run, lists of JSON or tuples. Raises ValueError."""
+    known = {f.name for f in fields(PriorConfig)}
+    if unknown := sorted(set(options) - known):
+        raise ValueError(f"the distillation has no option '{unknown[0]}'")
+    plain: Any = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
+    return PriorConfig(**plain)

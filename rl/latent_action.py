@@ -1,0 +1,120 @@
+"""Task policies in the space of the latent prior: a layer between a policy and its athlete.
+
+The policy's action is a latent, or rather where in the prior's distribution it lies; the frozen
+decoder makes PD targets of it. Any learner works with it as with any other action (PULSE; Luo et
+al. 2024, section 3.3).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from rl.prior import LatentPrior, PriorError, body_digest, check_layout
+from sports.humanoid.body import Body, is_finger
+from sports.scene import Scene
+
+
+@dataclass(frozen=True)
+class LatentConfig:
+    """How a policy acts through a latent prior (``--prior``)."""
+
+    combine: Literal["bounded", "free"] = "bounded"
+    """bounded: z = mu + sigma x ``span`` x tanh(a) with the prior's mu and sigma in the present
+    state, which keeps the policy human; free: z = mu + a, as in the PULSE paper."""
+    span: float = 2.5
+    """Standard deviations of the prior that a bounded policy reaches."""
+    arm_residual: float = 0.0
+    """Radians that the policy may add to the targets of the arm that holds the tool; 0 for none.
+    0.2 helps in racket sports."""
+
+    def __post_init__(self) -> None:
+        if self.span <= 0.0 or not 0.0 <= self.arm_residual <= math.pi:
+            raise ValueError("latent: span must be positive, arm_residual lie in [0, pi]")
+
+
+def arm_dofs(body: Body, tools: tuple[str, ...]) -> list[int]:
+    """Indices of the hinges of the arms that hold the ``tools`` (links), from the shoulder blade
+    on, fingers left out. Raises ValueError without a tool."""
+    if not tools:
+        raise ValueError("the task has no tool, so no arm for --latent.arm-residual: leave it out")
+    children = [link.parent for link in body.links]
+    arm: set[str] = set()
+    for tool in tools:
+        arm |= {name for name in body.subtree(tool) if not is_finger(name)}
+        at = body.links[body.link_index(tool)].parent
+        while at is not None and children.count(at) == 1:
+            arm.add(at)
+            at = body.links[body.link_index(at)].parent
+    return [i for i, dof in enumerate(body.dofs) if dof.link in arm]
+
+
+class LatentActions:
+    """(N, A, D) observations and (N, A, ``size``) policy's actions -> (N, A, n) actions."""
+
+    def __init__(
+        self,
+        prior: LatentPrior,
+        config: LatentConfig,
+        scene: Scene,
+        tools: tuple[str, ...],
+        device: torch.device | str,
+    ) -> None:
+        """Args:
+        prior: frozen networks with their normaliser; moved to ``device``.
+        config: see LatentConfig.
+        scene: of the task: its athlete, and the pose that its actions are around.
+        tools: links that hold the task's tool.
+        device: where the environment lives.
+
+        Raises PriorError for a prior of another body, ValueError for an arm without a tool.
+        """
+        body = scene.body
+        if prior.card["body_digest"] != body_digest(body):
+            raise PriorError(
+                f"the prior is of body '{prior.card['body']}', the athlete of this task is "
+                f"'{body.name}': use a prior of that body"
+            )
+        self.prior, self.config = prior.to(device), config
+        scale, offset = body.action_scale(), scene.action_offset()
+
+        def tensor(values: Any) -> Tensor:
+            return torch.tensor(values, dtype=torch.float32, device=device)
+
+        self._offset = tensor(offset / scale)
+        # Fingers keep the task's grasp: action 0 is its pose.
+        self._free = tensor([0.0 if is_finger(dof.link) else 1.0 for dof in body.dofs])
+        arm = arm_dofs(body, tools) if config.arm_residual > 0.0 else []
+        spread = torch.zeros(len(arm), body.num_dofs)
+        spread[torch.arange(len(arm)), arm] = 1.0
+        self._spread = spread.to(device) * config.arm_residual / tensor(scale)
+        self.size = prior.latent + len(arm)
+        """Numbers of the policy's action: the latent's, then the arm's hinges."""
+
+    @property
+    def card(self) -> dict[str, Any]:
+        """What a policy says about it."""
+        return {"prior_digest": self.prior.digest, **asdict(self.config)}
+
+    def check(self, slices: dict[str, slice]) -> None:
+        """Raises PriorError unless observations begin with the body as the prior sees it."""
+        check_layout(self.prior.card["layout"], slices)
+
+    def latent(self, obs: Tensor, action: Tensor) -> Tensor:
+        """(..., D), (..., size) -> (..., Z)."""
+        mean, sigma = self.prior.moments(obs)
+        a = action[..., : self.prior.latent].float()
+        if self.config.combine == "free":
+            return mean + a
+        return mean + sigma * self.config.span * torch.tanh(a)
+
+    @torch.no_grad()
+    def __call__(self, obs: Tensor, action: Tensor) -> Tensor:
+        """PD targets of the decoder, as the task's actions; the environment clips them."""
+        decoded = self.prior.decode(obs, self.latent(obs, action))
+        arm = torch.tanh(action[..., self.prior.latent :].float()) @ self._spread
+        return self._free * (decoded - self._offset) + arm
