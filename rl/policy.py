@@ -25,7 +25,7 @@ from warmstart.atomic import write_bytes, write_text
 
 FORMAT = "olympics-opt policy 1"
 BASELINES = ("zero", "random")
-ALGORITHMS = ("ppo", "amp")
+ALGORITHMS = ("ppo", "amp", "selfplay")
 """Those whose actor turns an observation into PD targets, which is what a policy is here."""
 MAX_WIDTH, MAX_LAYERS = 1 << 16, 32
 _REQUIRED = {
@@ -126,6 +126,16 @@ def load_policy(source: str | Path, task: str) -> Policy:
 
     Raises PolicyError when it is missing, truncated, altered, not a policy, or another task's.
     """
+    policy = read_policy(source, task)
+    found = policy.metadata["task"]
+    if found != task:
+        raise PolicyError(f"the policy '{source}' is of task '{found}', not of '{task}'")
+    return policy
+
+
+def read_policy(source: str | Path, task: str) -> Policy:
+    """As ``load_policy``, of whatever task a run or a file is; ``task`` says which shipped one is
+    meant and which task a baseline is for. Raises PolicyError."""
     text = str(source)
     if text in BASELINES:
         metadata = {"task": task, "algo": text, "action_size": 0, "sha256": ""}
@@ -138,18 +148,13 @@ def load_policy(source: str | Path, task: str) -> Policy:
     else:
         path = Path(source)
     if path.is_dir():
-        policy = _from_run(path)
-    elif path.is_file():
-        policy = _from_file(path)
-    else:
-        raise PolicyError(
-            f"there is no policy '{source}': give a run's folder, a .safetensors file, "
-            f"'pretrained' or one of {', '.join(BASELINES)}"
-        )
-    found = policy.metadata["task"]
-    if found != task:
-        raise PolicyError(f"the policy '{source}' is of task '{found}', not of '{task}'")
-    return policy
+        return _from_run(path)
+    if path.is_file():
+        return _from_file(path)
+    raise PolicyError(
+        f"there is no policy '{source}': give a run's folder, a .safetensors file, "
+        f"'pretrained' or one of {', '.join(BASELINES)}"
+    )
 
 
 def _from_run(run: Path) -> Policy:
