@@ -69,8 +69,8 @@ class TrainConfig:
     ``timestep_divisor`` of 2 or 4, in time step: half of them take longer ones, up to the full
     step. A policy that must hold in every engine needs it."""
     init: str | None = None
-    """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]; also of another
-    task with the same body and actions (tennis for tennis_1v1)."""
+    """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]; also that of
+    another task with the same body (tennis for tennis_1v1)."""
     clips: tuple[Path, ...] = ()
     """Demonstrations (npz): their frames may start episodes, and amp learns their style; for the
     task ``tracking`` the motions to follow: a packed library, or clips and folders of them."""
@@ -290,7 +290,9 @@ def config_from_dict(data: dict[str, Any]) -> TrainConfig:
         data["out"] = Path(data["out"])
         data["clips"] = tuple(Path(p) for p in data["clips"])
         data["start_probability"] = tuple(data["start_probability"])
-        return TrainConfig(**data, ppo=PPOConfig(**ppo), amp=AMPConfig(**amp), selfplay=SelfPlayConfig(**rivals))
+        return TrainConfig(
+            **data, ppo=PPOConfig(**ppo), amp=AMPConfig(**amp), selfplay=SelfPlayConfig(**rivals)
+        )
     except (TypeError, KeyError) as error:
         raise ValueError(f"the run's settings cannot be read ({error})") from error
 

@@ -201,7 +201,7 @@ def play_match(
     Raises as ``play_games`` does, PolicyError for policies that cannot be used, and RuntimeError
     for an engine that cannot run here.
     """
-    a, b = (p if isinstance(p, Policy) else load_policy(p, setting.task) for p in (first, second))
+    a, b = (_loaded(source, setting.task) for source in (first, second))
     worlds = setting.worlds or DEFAULT_WORLDS.get(setting.engine, DEFAULT_WORLDS["mujoco"])
     make, strength, limits = make or maker(setting, a), *_athlete(setting, a)
     games = play_games(a, b, make, setting.trials, setting.seed, worlds, progress)
@@ -232,7 +232,7 @@ def play_match(
 
 
 def play_ladder(
-    sources: Sequence[str | Path],
+    sources: Sequence[str | Path | Policy],
     setting: Setting,
     *,
     make: MakeEnv | None = None,
@@ -250,7 +250,7 @@ def play_ladder(
     pairs = [(i, j) for i in range(size) for j in range(i + 1, size)]
     scores, games = np.zeros((size, size)), np.zeros((size, size))
     tally, matches = np.zeros((size, 3), dtype=int), []
-    policies = [load_policy(source, setting.task) for source in sources]
+    policies = [_loaded(source, setting.task) for source in sources]
     if setting.strength is None:  # all meet as the same athlete
         setting = Setting(**{**vars(setting), "strength": _athlete(setting, policies[0])[0]})
     for k, (i, j) in enumerate(pairs):
@@ -322,6 +322,10 @@ def _athlete(setting: Setting, first: Policy) -> tuple[str, str]:
     card = first.metadata
     strength = setting.strength or str(card.get("strength", "paper"))
     return strength, setting.limits or str(card.get("limits", "paper"))
+
+
+def _loaded(source: str | Path | Policy, task: str) -> Policy:
+    return source if isinstance(source, Policy) else load_policy(source, task)
 
 
 def _name(source: str | Path | Policy) -> str:

@@ -2,9 +2,9 @@
 
 ``shared``, the better scheme: one network plays both sides (observations are in each athlete's own
 heading frame, so that sides look alike). In a part of the worlds it plays itself and learns from
-everybody; in the others a frozen snapshot plays one side, and it learns from its own. ``alternate``,
-the paper's (SMPLOlympics, section 4): two policies, each with its side; one is frozen with its
-normalisers while the other learns, and after some iterations they change places.
+everybody; in the others a frozen snapshot plays one side, and it learns from its own.
+``alternate``, the paper's (SMPLOlympics, section 4): two policies, each with its side; one is
+frozen with its normalisers while the other learns, and after some iterations they change places.
 
 The worlds with frozen opponents are dealt out evenly to slots, once; a world keeps its slot, and
 what is in a slot changes between iterations (``rl.league``). So one batched product a layer plays
@@ -59,7 +59,9 @@ class SelfPlayConfig:
         if min(self.pool, self.snapshot_samples, self.swap) < 1 or self.k_factor <= 0.0:
             raise ValueError("selfplay: pool, snapshot_samples, swap and k_factor must be positive")
         if not 0.5 <= self.snapshot_score <= 1.0:
-            raise ValueError(f"selfplay: snapshot_score must lie in [0.5, 1]: {self.snapshot_score}")
+            raise ValueError(
+                f"selfplay: snapshot_score must lie in [0.5, 1]: {self.snapshot_score}"
+            )
         if list(self.ladder) != sorted(set(self.ladder)) or min(self.ladder, default=1) < 1:
             raise ValueError("selfplay: the samples of the ladder must be positive and rising")
 

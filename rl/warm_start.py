@@ -3,7 +3,8 @@
 An actor reads slices of an observation with names (``body_pos``, ``goal/ball``, ...). A policy for
 one athlete, against a machine or nobody, becomes one for a contest: the columns of its first layer
 go to the slices of the same names, and those of slices it has never seen, such as the opponent,
-are zero. In the beginning it therefore plays as before, whatever the opponent does.
+are zero. In the beginning it therefore plays as before, whatever the opponent does. Where actions
+are around another pose, its last layer is made to ask for the same joint angles.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 
 import torch
 
+from rl.config import TRACKING
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError, read_policy
 from sports.env import make_scene
@@ -57,10 +59,8 @@ def _same_athlete(policy: Policy, env: Any, task: str, source: str) -> None:
         )
     if not isinstance(card.get("obs_layout"), dict):
         raise PolicyError(f"{where}: its card does not say what it observes")
-    if found in task_names() and task in task_names():
-        offsets = (make_scene(name).action_offset() for name in (found, task))
-        if any(abs(a - b) > 1e-6 for a, b in zip(*(x.tolist() for x in offsets))):
-            raise PolicyError(f"{where}: its actions are around another pose")
+    if TRACKING in (found, task):
+        raise PolicyError(f"{where}: actions of '{TRACKING}' are around the clips' poses")
 
 
 def _moved(policy: Policy, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
@@ -82,6 +82,17 @@ def _moved(policy: Policy, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
     old = columns.clamp(min=0)
     weights = dict(policy.actor.state_dict())
     weights["trunk.0.weight"] = weights["trunk.0.weight"][:, old].masked_fill(new, 0.0)
+    if card["task"] in task_names():
+        # The same PD targets: offset + scale a of one task in terms of the other's.
+        scene = make_scene(card["task"], limits=card["limits"])
+        offset, scale = (
+            torch.as_tensor(x, dtype=torch.float32, device=env.device)
+            for x in (scene.action_offset(), scene.body.action_scale())
+        )
+        ratio = (scale / env.action_scale).cpu()
+        shift = ((offset - env.action_offset) / env.action_scale).cpu()
+        weights["head.weight"] = ratio[:, None] * weights["head.weight"]
+        weights["head.bias"] = ratio * weights["head.bias"] + shift
     sizes = (env.obs_size, tuple(card["hidden"]), card["action_size"])
     actor = MLP(*sizes, card["activation"])
     actor.load_state_dict(weights)
