@@ -69,6 +69,27 @@ def test_stacked_opponents_act_as_each_one_alone():
             assert (told[slot] - alone).abs().max() <= 1e-6
 
 
+def test_stacked_opponents_multiply_as_ppo_does_in_bf16():
+    """Against the network under autocast; what was written is read again."""
+    g = torch.Generator().manual_seed(0)
+    actors = [MLP(9, (32, 16), 5, "silu", 1.0, g) for _ in range(3)]
+    stack = PolicyStack(actors[0], 3, 5.0, CPU, bf16=True)
+    zero, one = torch.zeros(9), torch.ones(9)
+    for slot, actor in enumerate(actors):
+        stack.write(slot, actor.state_dict(), zero + slot, one)
+    obs = torch.randn(3, 20, 9, generator=g)
+    told = stack(obs)
+    with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
+        for slot, actor in enumerate(actors):
+            alone = actor((obs[slot] - slot).clamp(-5, 5).to(torch.bfloat16))
+            assert (told[slot] - alone).abs().max() < 0.02  # steps of bf16 near 1 are 0.008
+            kept, mean, std = stack.read(slot)
+            assert torch.equal(mean, zero + slot) and torch.equal(std, one)
+            assert torch.equal(kept["head.weight"], actor.head.weight)
+            rounded = actor.trunk[0].weight.to(torch.bfloat16).float()
+            assert torch.equal(kept["trunk.0.weight"], rounded)
+
+
 @pytest.mark.parametrize("half", [1, 2])
 def test_worlds_sides_and_opponents_have_their_shares(half):
     """Half of the worlds with frozen opponents, each slot as many, sides alike in the long run."""
@@ -192,13 +213,12 @@ def test_a_snapshot_is_the_policy_of_its_moment():
             norm = agent.obs_norm
             kept.append((agent.actor.head.weight.detach().clone(), norm.mean.clone()))
     assert [e.samples for e in play.league.entries] == [0, 3, 6, 9, 12]
-    heads = play.stack.weights["head"]
     for number, (head, mean) in enumerate(kept, start=1):
         slots = [s for s, e in enumerate(play.league.slots) if e == number]
         assert slots
         for slot in slots:
-            assert torch.equal(heads[slot], head)
-            assert torch.equal(play.stack.mean[slot, 0], mean)
+            actor, shown, _ = play.stack.read(slot)
+            assert torch.equal(actor["head.weight"], head) and torch.equal(shown, mean)
 
 
 def test_a_good_score_brings_a_snapshot_early():
@@ -248,7 +268,9 @@ def test_in_turns_one_policy_learns_while_the_other_rests_as_it_was():
                 assert torch.equal(play.rival[k], resting[k]), k
             rival = next(i for i, e in enumerate(play.league.entries) if e.kind == "rival")
             for slot in (s for s, e in enumerate(play.league.slots) if e == rival):
-                assert torch.equal(play.stack.weights["head"][slot], resting["actor.head.weight"])
+                assert torch.equal(
+                    play.stack.read(slot)[0]["head.weight"], resting["actor.head.weight"]
+                )
             if i == 2:  # what the learner is when it goes to rest is what then rests
                 rollout = agent.new_rollout(96)
                 obs = collect(env, play, rollout, obs, SMALL.gamma, on_step=play.watch)
