@@ -307,13 +307,20 @@ class Match:
     """
 
     policies: Positional[Annotated[tuple[str, ...], arg(metavar="A B")]]
-    """Run folders, policy files, ``pretrained[:ALGO[-STRENGTH]]``, ``zero`` or ``random``."""
+    """Run folders, policy files, ``pretrained[:ALGO[-STRENGTH]]``, ``zero`` or ``random``; also the
+    frozen opponents of a run of self-play, ``RUN@SAMPLES`` and ``RUN@rival``."""
     task: str = ""
     """Sport with two sides; by default the one that the first run or file was trained on."""
     ladder: bool = False
     """A round robin of two or more policies."""
     out: Path | None = None
     """JSON file for the result."""
+    sheet: Path | None = None
+    """png or jpg file for 12 frames of the best and the median of 20 games of A on side 0."""
+    video: Path | None = None
+    """mp4 file for the best of them."""
+    renderer: Literal["gl", "software"] = "gl"
+    """Of the video: ``software`` needs no library and is slower."""
     trials: int = 100
     """Games, of each pair; an even number."""
     engine: Literal["mujoco", "warp", "drake"] = "mujoco"

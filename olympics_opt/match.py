@@ -8,6 +8,10 @@ from olympics_opt.progress import progress
 
 if TYPE_CHECKING:
     from olympics_opt.cli import Match
+    from rl.match import Setting
+
+DRAWN = 20
+"""Games from which the best and the median are drawn."""
 
 
 def run_match(config: Match) -> int:
@@ -29,6 +33,11 @@ def run_match(config: Match) -> int:
         limits=config.limits,
     )
     out = prepare(config.out) if config.out is not None else None
+    for path, suffixes in ((config.video, (".mp4",)), (config.sheet, (".png", ".jpg"))):
+        if path is not None and path.suffix.lower() not in suffixes:
+            raise ValueError(f"{path} must end in {' or '.join(suffixes)}")
+        if path is not None and config.ladder:
+            raise ValueError("a ladder is not drawn: leave --sheet and --video out")
     with progress(f"{task}, {config.engine}") as bar:
 
         def show(done: int, total: int) -> None:
@@ -45,7 +54,38 @@ def run_match(config: Match) -> int:
         print_match(result)
     if out is not None:
         print(f"wrote {write_json(out, result)}")
+    if config.sheet is not None or config.video is not None:
+        _draw(config, setting)
     return 0
+
+
+def _draw(config: Match, setting: Setting) -> None:
+    """The sheet and the video, of games with the first policy on side 0."""
+    from olympics_opt.render import render_sheet, render_video
+    from rl import provenance
+    from rl.evaluate import evaluate
+    from rl.match import Pair
+    from rl.policy import load_policy
+
+    first, second = (load_policy(name, setting.task) for name in config.policies)
+    played = evaluate(
+        Pair(first, second),
+        setting.task,
+        engine=setting.engine,
+        trials=min(DRAWN, setting.trials),
+        seed=setting.seed,
+        num_worlds=setting.worlds,
+        strength=setting.strength,
+        limits=setting.limits,
+        record=1,
+    )
+    if config.sheet is not None:
+        episodes: dict[str, Any] = {"best": played.best, "median": played.median}
+        print(f"wrote {render_sheet(episodes, config.sheet, commit=provenance.commit())}")
+    if config.video is not None:
+        best: Any = played.best
+        path = render_video(best, config.video, renderer=config.renderer, progress=True)
+        print(f"wrote {path}")
 
 
 def print_match(result: dict[str, Any]) -> None:

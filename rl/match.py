@@ -27,6 +27,45 @@ from sports.registry import get_task
 from sports.scene import Scene
 from sports.starts import add_noise
 
+
+class Pair(Policy):
+    """Two policies as one for all athletes of a world: the first plays side 0, the second side 1.
+
+    It can be played, recorded and drawn like a policy; its card is the first one's.
+    """
+
+    def __init__(self, first: Policy, second: Policy) -> None:
+        card = {**first.metadata, "algo": _against(first, second)}
+        super().__init__(None, torch.zeros(0), torch.ones(0), card)
+        self.sides = (first, second)
+
+    def __call__(self, obs: Tensor) -> Tensor:
+        """(N, A, obs) -> (N, A, act)."""
+        return torch.cat([p(seen) for p, seen in zip(self.sides, obs.chunk(2, dim=1))], 1)
+
+    def to(self, device: torch.device | str) -> Pair:
+        """The same policies on a device (moved in place)."""
+        for policy in self.sides:
+            policy.to(device)
+        return self
+
+    def seed(self, seed: int) -> None:
+        """Starts the noise of ``random`` anew, another on either side."""
+        for side, policy in enumerate(self.sides):
+            policy.seed(seed + side)
+
+    def check(self, env: Any) -> None:
+        """Raises PolicyError where one does not fit, ValueError for a task without two sides."""
+        if env.num_agents < 2 or env.num_agents % 2:
+            raise ValueError(f"task '{env.task.name}' has no two sides: there is no match to play")
+        for policy in self.sides:
+            policy.check(env)
+
+
+def _against(first: Policy, second: Policy) -> str:
+    return f"{first.metadata['algo']} against {second.metadata['algo']}"
+
+
 MakeEnv = Callable[[int, int], Any]
 """(worlds, seed) -> environment."""
 
@@ -128,13 +167,9 @@ def _half(
     episodes = math.ceil(games / worlds)
     env = make(math.ceil(games / episodes), seed)
     try:
-        half = env.num_agents // 2
-        if env.num_agents < 2 or env.num_agents % 2:
-            raise ValueError(f"task '{env.task.name}' has no two sides: there is no match to play")
-        for side, policy in enumerate(pair):
-            policy.check(env)
-            policy.to(env.device)
-            policy.seed(seed + side)
+        players = Pair(*pair)
+        players.check(env)
+        players.to(env.device).seed(seed)
         names = tuple(env.metric_names)
         outcome = np.full((episodes, env.num_worlds), np.nan)
         table = {n: np.full((episodes, env.num_worlds), np.nan) for n in names}
@@ -142,9 +177,7 @@ def _half(
         with one_torch_thread(env.device):
             obs = env.reset()
             while (episode < episodes).any():
-                teams = (obs[:, :half], obs[:, half:])
-                action = torch.cat([p(seen) for p, seen in zip(pair, teams)], 1)
-                result = env.step(action)
+                result = env.step(players(obs))
                 obs = result.obs
                 valid = result.valid.cpu().numpy()
                 ended = result.ended.cpu().numpy() | ~valid
@@ -208,7 +241,7 @@ def play_match(
     return {
         "kind": "match",
         "task": setting.task,
-        "algo": f"{a.metadata['algo']} against {b.metadata['algo']}",
+        "algo": _against(a, b),
         "policy": _name(first),
         "policy_sha256": a.metadata["sha256"],
         "opponent": {

@@ -1,7 +1,8 @@
 """Trained policies as files: an actor in fp16 safetensors and a JSON card that says what it is.
 
-``load_policy`` accepts such a file, a run's folder, ``pretrained[:ALGO[-STRENGTH]]``, and the
-baselines ``zero`` and ``random``.
+``load_policy`` accepts such a file, a run's folder, a frozen opponent of a run of self-play
+(``RUN@SAMPLES``, ``RUN@rival``), ``pretrained[:ALGO[-STRENGTH]]``, and the baselines ``zero`` and
+``random``.
 """
 
 from __future__ import annotations
@@ -120,8 +121,8 @@ def load_policy(source: str | Path, task: str) -> Policy:
 
     Args:
         source: ``FILE.safetensors`` with ``FILE.json`` beside it, a run's folder (its last
-            checkpoint), ``pretrained``, ``pretrained:ALGO``, ``pretrained:ALGO-STRENGTH``,
-            ``zero`` (PD target zero) or ``random`` (uniform actions).
+            checkpoint), ``RUN@SAMPLES`` or ``RUN@rival``, ``pretrained``, ``pretrained:ALGO``,
+            ``pretrained:ALGO-STRENGTH``, ``zero`` (PD target zero) or ``random`` (uniform).
         task: the task that it must be trained on.
 
     Raises PolicyError when it is missing, truncated, altered, not a policy, or another task's.
@@ -151,6 +152,9 @@ def read_policy(source: str | Path, task: str) -> Policy:
         return _from_run(path)
     if path.is_file():
         return _from_file(path)
+    run, at, which = text.rpartition("@")
+    if at and Path(run).is_dir():
+        return _from_pool(Path(run), which)
     raise PolicyError(
         f"there is no policy '{source}': give a run's folder, a .safetensors file, "
         f"'pretrained' or one of {', '.join(BASELINES)}"
@@ -175,6 +179,35 @@ def _from_run(run: Path) -> Policy:
         if k.startswith(("agent/critic.", "agent/value_norm."))
     }
     return policy
+
+
+def _from_pool(run: Path, which: str) -> Policy:
+    """A frozen opponent in the last checkpoint of a run of self-play."""
+    learner = _from_run(run)
+    state, tensors = load_checkpoint(checkpoints(run)[-1])
+    league = state.get("selfplay", {}).get("league", {"entries": [], "slots": []})
+    names = [
+        "rival" if entry["kind"] == "rival" else str(entry["samples"])
+        for entry in league["entries"]
+    ]
+    if which not in names:
+        have = f"it has {', '.join('@' + name for name in names)}" if names else "it has none"
+        raise PolicyError(f"the run '{run}' has no opponent '@{which}': {have}")
+    slot = league["slots"].index(names.index(which))
+    assert learner.actor is not None
+    weights = {}
+    for name in learner.actor.state_dict():
+        x = tensors[f"selfplay/stack.{name}"][slot].float()
+        weights[name] = x.T.contiguous() if name.endswith(".weight") else x[0].contiguous()
+    card = {
+        **learner.metadata,
+        "samples": int(league["entries"][names.index(which)]["samples"]),
+        "metrics": {},
+        "obs_mean": tensors["selfplay/stack.mean"][slot, 0].tolist(),
+        "obs_std": tensors["selfplay/stack.std"][slot, 0].tolist(),
+        "sha256": hashlib.sha256(save(weights)).hexdigest(),
+    }
+    return _build(card, weights, f"{run}@{which}")
 
 
 def _from_file(path: Path) -> Policy:

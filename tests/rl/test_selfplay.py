@@ -17,7 +17,7 @@ import torch
 from rl.checkpoint import checkpoints, load_checkpoint
 from rl.networks import MLP
 from rl.normalizer import Normalizer
-from rl.policy import load_policy
+from rl.policy import PolicyError, load_policy
 from rl.policy_stack import PolicyStack
 from rl.ppo import PPO
 from rl.rollout import collect
@@ -317,6 +317,27 @@ def test_teams_of_two_learn_too(tmp_path):
     assert (said - law(x)).abs().mean() < 0.12
 
 
+def test_a_frozen_opponent_of_a_run_is_the_run_as_it_was(tmp_path):
+    """Against runs that ended there: by samples; and in turns the rival, when the places have just
+    been changed, against one that has not changed them."""
+    obs = torch.rand(50, 2, generator=torch.Generator().manual_seed(2))
+
+    def said(name: str, samples: int, config: SelfPlayConfig, which: str = "") -> torch.Tensor:
+        run = contest_config(tmp_path / name, samples=samples, selfplay=config)
+        train(run, environment=contest_env)
+        return load_policy(f"{run.out}{which}", "contest")(obs)
+
+    now = said("long", 6 * 576, FEW, "@2304")
+    assert torch.equal(now, said("short", 4 * 576, FEW))
+    assert load_policy(f"{tmp_path / 'long'}@2304", "contest").metadata["samples"] == 2304
+    assert not torch.equal(now, load_policy(tmp_path / "long", "contest")(obs))
+    # The first iteration only shows; three of learning make a turn.
+    rested = said("turned", 4 * 384, dataclasses.replace(ALTERNATE, swap=3), "@rival")
+    assert torch.equal(rested, said("still", 4 * 384, dataclasses.replace(ALTERNATE, swap=99)))
+    with pytest.raises(PolicyError, match="it has @0, @2304"):
+        load_policy(f"{tmp_path / 'long'}@17", "contest")
+
+
 @pytest.mark.parametrize("config", [FEW, ALTERNATE], ids=["shared", "alternate"])
 def test_a_resumed_run_repeats_the_uninterrupted_one_bit_for_bit(tmp_path, config):
     base = contest_config(tmp_path / "whole", samples=11 * 576, selfplay=config)
@@ -357,6 +378,32 @@ def test_kill_at_any_moment_then_resume_is_the_uninterrupted_run(tmp_path):
         pytest.skip("this machine was too quick to be killed in time")
     train(contest_config(killed, samples=40 * 576, resume=True), environment=contest_env)
     same_bits(tmp_path / "whole", killed)
+
+
+def test_two_ranks_meet_the_same_opponents(tmp_path):
+    """gloo on the CPU: worlds and sides differ, opponents, ratings and weights do not."""
+    launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    script = str(Path(__file__).with_name("contest.py"))
+    env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, *launch, script, str(tmp_path), str(10 * 1152)],
+        cwd=ROOT,
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert [r["samples"] for r in read_progress(tmp_path)] == [1152 * (i + 1) for i in range(10)]
+    # Two episodes of 24 worlds on each rank; later some have an opponent exchanged.
+    assert read_progress(tmp_path)[0]["selfplay/games"] == 2 * 2 * 24
+    path = checkpoints(tmp_path)[-1]
+    state, zero = load_checkpoint(path, 0)
+    one = load_checkpoint(path, 1)[1]
+    assert len(state["selfplay"]["league"]["entries"]) > 3
+    alike = [k for k in zero if k.startswith(("selfplay/stack.", "agent/actor."))]
+    assert all(torch.equal(zero[k], one[k]) for k in alike)
+    assert not torch.equal(zero["selfplay/worlds"], one["selfplay/worlds"])
 
 
 def test_what_cannot_be_is_refused_with_a_sentence(tmp_path):
