@@ -7,6 +7,7 @@ Source: Elo 1978; fitted by maximum likelihood as Bradley and Terry 1952.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,24 @@ def difference(score: float) -> float:
     if score <= 0.0:
         return -math.inf
     return math.inf if score >= 1.0 else SCALE * math.log10(score / (1.0 - score))
+
+
+def performance(scores: Sequence[float], games: Sequence[float], ratings: Sequence[float]) -> float:
+    """The rating that is expected to score what was scored against opponents of known ratings.
+
+    ``scores`` are sums over ``games`` with each opponent. Each opponent met is given one more game,
+    a draw, so that there is such a rating. Raises ValueError without games.
+    """
+    met = [(s + 0.5, n + 1.0, r) for s, n, r in zip(scores, games, ratings) if n > 0]
+    if not met:
+        raise ValueError("there are no games to rate")
+    wanted = sum(s for s, _, _ in met)
+    low, high = min(ratings) - 10.0 * SCALE, max(ratings) + 10.0 * SCALE
+    for _ in range(60):  # bisection, to far below a point
+        middle = 0.5 * (low + high)
+        got = sum(n * expected(middle - r) for _, n, r in met)
+        low, high = (middle, high) if got < wanted else (low, middle)
+    return 0.5 * (low + high)
 
 
 @dataclass(frozen=True)

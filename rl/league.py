@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from rl.elo import expected
+from rl.elo import expected, performance
 
 Kind = Literal["ladder", "pool", "rival"]
 WINDOW = 200.0
@@ -122,9 +122,12 @@ class League:
         mean = sum(e.lost / e.games for e in known) / len(known)
         return mean, sum(e.games for e in known)
 
-    def count(self, kind: Kind) -> int:
-        """Entries of a kind."""
-        return sum(e.kind == kind for e in self.entries)
+    def ladder_rating(self) -> float | None:
+        """Rating of the latest policy by its last games against the ladder alone."""
+        met = [e for e in self.entries if e.kind == "ladder" and e.games > 0]
+        if not met:
+            return None
+        return performance([e.lost for e in met], [e.games for e in met], [e.rating for e in met])
 
     def state(self) -> dict[str, Any]:
         """Everything, as plain JSON."""

@@ -68,6 +68,7 @@ class SelfPlayConfig:
 
 STATISTICS = (
     "selfplay/elo",
+    "selfplay/elo_ladder",
     "selfplay/score_pool",
     "selfplay/score_ladder",
     "selfplay/score_rival",
@@ -265,6 +266,7 @@ class SelfPlay:
         played = wins + draws + losses
         values = (
             self.league.rating,
+            self.league.ladder_rating(),
             self.league.score("pool")[0],
             self.league.score("ladder")[0],
             self.league.score("rival")[0],

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from rl.elo import difference, expected, fit, score
+from rl.elo import difference, expected, fit, performance, score
 from rl.league import FROZEN_SHARE, MOST_GAMES, WINDOW, League
 
 
@@ -83,6 +83,20 @@ def test_two_players_have_a_closed_form():
     assert half[1] == pytest.approx(1.959964 / (rate * math.sqrt(101 * p * (1 - p))), rel=1e-5)
     with pytest.raises(ValueError, match="do not connect"):
         fit(np.zeros((2, 2)), np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize(("won", "rating"), [(10, -60.0), (0, 35.0), (100, 200.0)])
+def test_performance_against_one_opponent_has_a_closed_form(won, rating):
+    found = performance([won, 0.0], [100, 0], [rating, 1e6])  # nobody met the other one
+    assert found == pytest.approx(rating + difference((won + 0.5) / 101), abs=1e-6)
+
+
+def test_performance_against_several_is_the_strength_that_played():
+    rng, true, ratings = np.random.default_rng(5), 130.0, [0.0, 90.0, 310.0]
+    scores = [float(rng.binomial(4000, expected(true - r))) for r in ratings]
+    assert performance(scores, [4000.0] * 3, ratings) == pytest.approx(true, abs=10.0)
+    with pytest.raises(ValueError, match="no games"):
+        performance([0.0], [0.0], [0.0])
 
 
 def played(league: League, strength: float, strengths: list[float], games: int, rng) -> list:

@@ -10,7 +10,7 @@ import torch
 
 from olympics_opt.cli import main
 from rl.elo import difference
-from rl.match import Setting, _half, play_games, play_ladder, play_match, task_of
+from rl.match import Pair, Setting, _half, play_games, play_ladder, play_match, task_of
 from rl.policy import PolicyError
 from tests.rl.contest import Contest, speaker
 
@@ -49,6 +49,17 @@ def test_a_match_is_antisymmetric():
     assert elo["mean"] == pytest.approx(difference(score["mean"]))
     assert there["opponent_metrics"] == {"success": back["metrics"]["success"]}
     assert (there["algo"], there["policy_sha256"]) == ("ppo against ppo", "0.0")
+
+
+def test_a_pair_moves_each_team_by_its_own_policy():
+    """Two against two; the sum of a team's says is its policy's."""
+    a, b = speaker(0.1, seed=1), speaker(-0.4, seed=2)
+    obs = torch.rand(5, 4, 2, generator=torch.Generator().manual_seed(0))
+    pair = Pair(a, b)
+    told = pair(obs)
+    assert torch.equal(told[:, :2], a(obs[:, :2])) and torch.equal(told[:, 2:], b(obs[:, 2:]))
+    pair.check(Contest(2, half=2))
+    assert pair.metadata["algo"] == "ppo against ppo"
 
 
 def test_equals_draw():

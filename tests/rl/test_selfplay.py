@@ -86,7 +86,7 @@ def test_stacked_opponents_multiply_as_ppo_does_in_bf16():
             kept, mean, std = stack.read(slot)
             assert torch.equal(mean, zero + slot) and torch.equal(std, one)
             assert torch.equal(kept["head.weight"], actor.head.weight)
-            rounded = actor.trunk[0].weight.to(torch.bfloat16).float()
+            rounded = actor.get_parameter("trunk.0.weight").to(torch.bfloat16).float()
             assert torch.equal(kept["trunk.0.weight"], rounded)
 
 
