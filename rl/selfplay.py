@@ -139,7 +139,7 @@ class SelfPlay:
         """(P,) worlds with frozen opponents; those of a slot follow each other"""
         alike = order[self.frozen :].to(self.device)
         members = torch.arange(self.agents, device=self.device)
-        self._alike = (alike[:, None] * self.agents + members).flatten()
+        self._alike: Tensor = (alike[:, None] * self.agents + members).flatten()
         self._team = torch.arange(self.half, device=self.device)
         self.learned_rows = len(self._alike) + self.frozen * self.half
         """Rows of a step that are learned from."""
@@ -318,7 +318,8 @@ class SelfPlay:
         """The tensors: opponents, sides, the rival, noise."""
         state = {f"stack.{k}": v for k, v in self.stack.state_dict().items()}
         state |= {f"rival.{k}": v for k, v in self.rival.items()}
-        state |= {"worlds": self.worlds, "side": self.side, "rated": self.rated}
+        state |= {"worlds": self.worlds, "alike": self._alike}
+        state |= {"side": self.side, "rated": self.rated}
         return state | {"generator": self.generator.get_state()}
 
     def load(self, state: dict[str, Any], tensors: dict[str, Tensor]) -> None:
@@ -332,8 +333,9 @@ class SelfPlay:
             setattr(self, name, int(state[name]))
         self.stack.load_state_dict(part("stack."))
         self.rival = {k: v.to(self.device) for k, v in part("rival.").items()}
-        if not torch.equal(tensors["worlds"].to(self.device), self.worlds):
-            raise ValueError("the checkpoint deals out other worlds than this run")
-        self.side.copy_(tensors["side"])
-        self.rated.copy_(tensors["rated"])
+        own = {"worlds": self.worlds, "alike": self._alike, "side": self.side, "rated": self.rated}
+        for name, x in own.items():
+            if tensors[name].shape != x.shape:
+                raise ValueError("the checkpoint deals out another number of worlds than this run")
+            x.copy_(tensors[name])
         self.generator.set_state(tensors["generator"].cpu())
