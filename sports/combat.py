@@ -44,7 +44,7 @@ CREDIT = 1.0
 """Seconds after a weapon's contact with the opponent for which the opponent's fall is its doing."""
 NEVER = 1e6
 """Steps since a contact that has not been yet."""
-FACING, VELOCITY, STRIKE, POINT = 0.1, 0.1, 0.6, 1.0
+FACING, VELOCITY, STRIKE = 0.1, 0.1, 0.6
 """Weights of the reward's terms."""
 WANTED_SPEED = 1.0
 """Towards the opponent (m/s); more is not paid."""
@@ -60,13 +60,17 @@ steps of two athletes thrashing on top of each other (144, 35); at play it is ab
 class Options:
     """Options of both duels. Raises ValueError for a reward below 0."""
 
+    point: float = 1.0
+    """Reward for a point, and cost of the opponent's. The paper's 1 is little beside the up to 0.6
+    of every step in which a weapon is near the opponent."""
     knock_down: float = 0.0
     """Reward for the opponent's fall within 1 s after one's own weapon was in contact with it, and
     cost of such a fall; 0 for the paper's terms alone. A fall without contact earns nothing."""
 
     def __post_init__(self) -> None:
-        if self.knock_down < 0.0:
-            raise ValueError(f"the reward 'knock_down' must not be negative: {self.knock_down}")
+        for name in ("point", "knock_down"):
+            if getattr(self, name) < 0.0:
+                raise ValueError(f"the reward '{name}' must not be negative: {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -228,7 +232,7 @@ def advance(
         "facing": FACING * facing,
         "velocity": VELOCITY * velocity,
         "strike": STRIKE * strike,
-        "point": POINT * (scored - scored.flip(1)),
+        "point": view.config.point * (scored - scored.flip(1)),
         "knock_down": view.config.knock_down * (downed - downed.flip(1)),
     }
 

@@ -459,3 +459,15 @@ def test_a_contact_in_a_clinch_brings_no_credit(task):
     bout.step((0, 500.0))
     step = bout.step(ground={(1, "L_Hand"): 51.0})
     assert step.terms["knock_down"].abs().sum() == 0.0
+
+
+def test_rewards_as_the_options_say(task):
+    bout = Bout(task)
+    config = type(bout.env.view.config)
+    bout.env.view.config = config(point=5.0)
+    bout.reach_out(0.2)
+    bout.begin()
+    assert bout.step((0, 500.0)).terms["point"][0].tolist() == [5.0, -5.0]
+    for name in ("point", "knock_down"):
+        with pytest.raises(ValueError, match=f"'{name}' must not be negative"):
+            config(**{name: -1.0})
