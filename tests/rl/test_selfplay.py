@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from rl.checkpoint import checkpoints, load_checkpoint
+from rl.graph import GraphedStep
 from rl.networks import MLP
 from rl.normalizer import Normalizer
 from rl.policy import PolicyError, load_policy
@@ -180,6 +181,7 @@ def test_all_samples_of_the_latest_policy_are_learned_from_and_once_an_epoch():
     rollout = agent.new_rollout(96)
     collect(env, play, rollout, env.reset(), SMALL.gamma, on_step=play.watch)
     seen: list[torch.Tensor] = []
+    assert isinstance(agent._step, GraphedStep)
     agent._step._step = seen.append
     play.learn(rollout)
     own = torch.ones(SMALL.steps, 96, dtype=torch.bool).scatter(1, play._theirs, False)
