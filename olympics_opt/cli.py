@@ -299,6 +299,43 @@ class Likeness:
 
 
 @dataclass(frozen=True)
+class Match:
+    """Let one policy play another: wins, draws, losses and Elo with 95 % intervals.
+
+    Sides are changed in half of the games. ``--ladder A B C ...`` plays every pair and rates all,
+    the first policy at 0.
+    """
+
+    policies: Positional[Annotated[tuple[str, ...], arg(metavar="A B")]]
+    """Run folders, policy files, ``pretrained[:ALGO[-STRENGTH]]``, ``zero`` or ``random``; also the
+    frozen opponents of a run of self-play, ``RUN@SAMPLES`` and ``RUN@rival``."""
+    task: str = ""
+    """Sport with two sides; by default the one that the first run or file was trained on."""
+    ladder: bool = False
+    """A round robin of two or more policies."""
+    out: Path | None = None
+    """JSON file for the result."""
+    sheet: Path | None = None
+    """png or jpg file for 12 frames of the best and the median of 20 games of A on side 0."""
+    video: Path | None = None
+    """mp4 file for the best of them."""
+    renderer: Literal["gl", "software"] = "gl"
+    """Of the video: ``software`` needs no library and is slower."""
+    trials: int = 100
+    """Games, of each pair; an even number."""
+    engine: Literal["mujoco", "warp", "drake"] = "mujoco"
+    """Physics engine; ``warp`` needs a GPU."""
+    seed: int = 0
+    """Seed of all randomness."""
+    worlds: int | None = None
+    """Worlds simulated at a time; by default as many as suit the engine."""
+    strength: Literal["paper", "human"] | None = None
+    """Strength of the athletes; by default the one the first policy was trained with."""
+    limits: Literal["paper", "anatomical"] | None = None
+    """Joint ranges; by default those the first policy was trained with."""
+
+
+@dataclass(frozen=True)
 class Leaderboard:
     """Rebuild results/README.md and the results of README.md from results/*.json."""
 
@@ -339,6 +376,7 @@ COMMANDS: dict[str, Command] = {
     "mocap": Command(
         None, "olympics_opt.mocap:main", summary="Make clips of recorded motions of people."
     ),
+    "match": Command(Match, "olympics_opt.match:run_match"),
     "tracker": Command(Tracker, "olympics_opt.tracker:run_tracker"),
     "likeness": Command(Likeness, "olympics_opt.likeness:run_likeness"),
     "prior": Command(

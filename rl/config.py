@@ -18,6 +18,7 @@ from rl.checkpoint import checkpoints, read_state
 from rl.host import local_ranks
 from rl.latent_action import LatentConfig
 from rl.ppo import PAPER, PPOConfig
+from rl.selfplay import SelfPlayConfig
 from sports.env import Env, Starts, make_env
 from sports.physics.variation import Variation
 from sports.registry import get_task, task_names
@@ -38,9 +39,10 @@ class TrainConfig:
     """Name of the task."""
     out: Path = Path("runs/train")
     """Folder of the run."""
-    algo: Literal["ppo", "amp", "latent", "latent-amp"] = "ppo"
-    """Learner: ppo, or amp, which also pays for moving like the ``clips``. With ``--prior`` they
-    are latent and latent-amp."""
+    algo: Literal["ppo", "amp", "selfplay", "latent", "latent-amp"] = "ppo"
+    """Learner: ppo; amp, which also pays for moving like the ``clips``; or selfplay, ppo against
+    itself and its past, for tasks with two sides. With ``--prior`` the first two are latent and
+    latent-amp."""
     engine: Literal["mujoco", "warp", "drake"] = "mujoco"
     """Physics engine: mujoco needs no GPU, warp needs one, drake is for checking, not training."""
     worlds: int | None = None
@@ -71,7 +73,8 @@ class TrainConfig:
     ``timestep_divisor`` of 2 or 4, in time step: half of them take longer ones, up to the full
     step. A policy that must hold in every engine needs it."""
     init: str | None = None
-    """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]."""
+    """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]; also that of
+    another task with the same body (tennis for tennis_1v1)."""
     clips: tuple[Path, ...] = ()
     """Demonstrations (npz): their frames may start episodes, and amp learns their style; for the
     task ``tracking`` the motions to follow: a packed library, or clips and folders of them."""
@@ -104,6 +107,8 @@ class TrainConfig:
     """Hyper-parameters."""
     amp: AMPConfig = field(default_factory=AMPConfig)
     """Hyper-parameters of the style, for ``--algo amp``."""
+    selfplay: SelfPlayConfig = field(default_factory=SelfPlayConfig)
+    """Opponents, for ``--algo selfplay``."""
     device: str = "auto"
     """Where the networks live: auto (a GPU if there is one), cpu, cuda."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
@@ -138,6 +143,12 @@ class TrainConfig:
             raise ValueError("the targets of a clip are no latents: leave --clone or --prior out")
         if not self.styled and self.amp != AMPConfig():
             raise ValueError("the --amp options need --algo amp")
+        if self.algo != "selfplay" and self.selfplay != SelfPlayConfig():
+            raise ValueError("the --selfplay options need --algo selfplay")
+        if self.algo == "selfplay" and self.clone:
+            raise ValueError("cloning shows one athlete's episode: leave --algo selfplay out")
+        if self.algo == "selfplay" and self.prior is not None:
+            raise ValueError("selfplay does not play through a latent prior yet: leave --prior out")
         if self.styled and self.task == TRACKING:
             raise ValueError("the tracker follows its clips frame by frame: leave --algo amp out")
         if self.prior is None and (self.algo.startswith("latent") or self.latent != LatentConfig()):
@@ -316,12 +327,14 @@ def config_from_dict(data: dict[str, Any]) -> TrainConfig:
             ppo[name] = tuple(ppo[name]) if ppo[name] is not None else None
         amp = dict(data.pop("amp", {}))  # none in runs of versions without it
         amp |= {"hidden": tuple(amp["hidden"])} if "hidden" in amp else {}
+        rivals = dict(data.pop("selfplay", {}))
+        rivals |= {"ladder": tuple(rivals["ladder"])} if "ladder" in rivals else {}
         data["out"] = Path(data["out"])
         data["clips"] = tuple(Path(p) for p in data["clips"])
         data["start_probability"] = tuple(data["start_probability"])
         latent = LatentConfig(**data.pop("latent", {}))
         how = {"ppo": PPOConfig(**ppo), "amp": AMPConfig(**amp), "latent": latent}
-        return TrainConfig(**data, **how)
+        return TrainConfig(**data, **how, selfplay=SelfPlayConfig(**rivals))
     except (TypeError, KeyError) as error:
         raise ValueError(f"the run's settings cannot be read ({error})") from error
 

@@ -68,6 +68,24 @@ class Normalizer:
         self._pending = torch.zeros_like(self._pending)
         self._refresh()
 
+    def adopt(self, columns: Tensor) -> None:
+        """Gives some features (D,) bool, of which nothing is known yet, the moments that are now
+        pending in all ranks, as if every sample in use had shown them. Call it before ``commit``.
+        """
+        seen = self._pending
+        if dist.is_initialized():
+            parts = [torch.empty_like(seen) for _ in range(dist.get_world_size())]
+            dist.all_gather(parts, seen)
+            seen = parts[0]
+            for part in parts[1:]:
+                seen = merge(seen, part)
+        count, mean, squares = _split(self._total)
+        shown, new_mean, new_squares = _split(seen)
+        new_squares = new_squares * (count / shown.clamp(min=1.0))
+        mean = torch.where(columns, new_mean, mean)
+        squares = torch.where(columns, new_squares, squares)
+        self._total = torch.cat((count[None], mean, squares))
+
     def normalize(self, x: Tensor) -> Tensor:
         """(..., D) -> (..., D) of zero mean, unit variance, clamped; float32."""
         return ((x - self.mean) / self.std).clamp(-self.clip, self.clip)

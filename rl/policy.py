@@ -1,7 +1,8 @@
 """Trained policies as files: an actor in fp16 safetensors and a JSON card that says what it is.
 
-``load_policy`` accepts such a file, a run's folder, ``pretrained[:ALGO[-STRENGTH]]``, and the
-baselines ``zero`` and ``random``.
+``load_policy`` accepts such a file, a run's folder, a frozen opponent of a run of self-play
+(``RUN@SAMPLES``, ``RUN@rival``), ``pretrained[:ALGO[-STRENGTH]]``, and the baselines ``zero`` and
+``random``.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from warmstart.atomic import write_bytes, write_text
 
 FORMAT = "olympics-opt policy 1"
 BASELINES = ("zero", "random")
-ALGORITHMS = ("ppo", "amp", "latent", "latent-amp")
+ALGORITHMS = ("ppo", "amp", "selfplay", "latent", "latent-amp")
 """Those whose actor turns an observation into PD targets, which is what a policy is here, or into
 latents of a prior (``latent``), which it is told of by its card."""
 MAX_WIDTH, MAX_LAYERS = 1 << 16, 32
@@ -155,12 +156,22 @@ def load_policy(source: str | Path, task: str) -> Policy:
 
     Args:
         source: ``FILE.safetensors`` with ``FILE.json`` beside it, a run's folder (its last
-            checkpoint), ``pretrained``, ``pretrained:ALGO``, ``pretrained:ALGO-STRENGTH``,
-            ``zero`` (PD target zero) or ``random`` (uniform actions).
+            checkpoint), ``RUN@SAMPLES`` or ``RUN@rival``, ``pretrained``, ``pretrained:ALGO``,
+            ``pretrained:ALGO-STRENGTH``, ``zero`` (PD target zero) or ``random`` (uniform).
         task: the task that it must be trained on.
 
     Raises PolicyError when it is missing, truncated, altered, not a policy, or another task's.
     """
+    policy = read_policy(source, task)
+    found = policy.metadata["task"]
+    if found != task:
+        raise PolicyError(f"the policy '{source}' is of task '{found}', not of '{task}'")
+    return policy
+
+
+def read_policy(source: str | Path, task: str) -> Policy:
+    """As ``load_policy``, of whatever task a run or a file is; ``task`` says which shipped one is
+    meant and which task a baseline is for. Raises PolicyError."""
     text = str(source)
     if text in BASELINES:
         metadata = {"task": task, "algo": text, "action_size": 0, "sha256": ""}
@@ -173,18 +184,16 @@ def load_policy(source: str | Path, task: str) -> Policy:
     else:
         path = Path(source)
     if path.is_dir():
-        policy = _from_run(path)
-    elif path.is_file():
-        policy = _from_file(path)
-    else:
-        raise PolicyError(
-            f"there is no policy '{source}': give a run's folder, a .safetensors file, "
-            f"'pretrained' or one of {', '.join(BASELINES)}"
-        )
-    found = policy.metadata["task"]
-    if found != task:
-        raise PolicyError(f"the policy '{source}' is of task '{found}', not of '{task}'")
-    return policy
+        return _from_run(path)
+    if path.is_file():
+        return _from_file(path)
+    run, at, which = text.rpartition("@")
+    if at and Path(run).is_dir():
+        return _from_pool(Path(run), which)
+    raise PolicyError(
+        f"there is no policy '{source}': give a run's folder, a .safetensors file, "
+        f"'pretrained' or one of {', '.join(BASELINES)}"
+    )
 
 
 def _from_run(run: Path) -> Policy:
@@ -205,6 +214,35 @@ def _from_run(run: Path) -> Policy:
         if k.startswith(("agent/critic.", "agent/value_norm."))
     }
     return _with_prior(policy, run)
+
+
+def _from_pool(run: Path, which: str) -> Policy:
+    """A frozen opponent in the last checkpoint of a run of self-play."""
+    learner = _from_run(run)
+    state, tensors = load_checkpoint(checkpoints(run)[-1])
+    league = state.get("selfplay", {}).get("league", {"entries": [], "slots": []})
+    names = [
+        "rival" if entry["kind"] == "rival" else str(entry["samples"])
+        for entry in league["entries"]
+    ]
+    if which not in names:
+        have = f"it has {', '.join('@' + name for name in names)}" if names else "it has none"
+        raise PolicyError(f"the run '{run}' has no opponent '@{which}': {have}")
+    slot = league["slots"].index(names.index(which))
+    assert learner.actor is not None
+    weights = {}
+    for name in learner.actor.state_dict():
+        x = tensors[f"selfplay/stack.{name}"][slot].float()
+        weights[name] = x.T.contiguous() if name.endswith(".weight") else x[0].contiguous()
+    card = {
+        **learner.metadata,
+        "samples": int(league["entries"][names.index(which)]["samples"]),
+        "metrics": {},
+        "obs_mean": tensors["selfplay/stack.mean"][slot, 0].tolist(),
+        "obs_std": tensors["selfplay/stack.std"][slot, 0].tolist(),
+        "sha256": hashlib.sha256(save(weights)).hexdigest(),
+    }
+    return _build(card, weights, f"{run}@{which}")
 
 
 def _from_file(path: Path) -> Policy:

@@ -226,9 +226,14 @@ class PPO:
         return self.obs_norm.normalize(torch.nan_to_num(obs)).to(self.obs_dtype)
 
     @torch.no_grad()
-    def act(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """obs (M, D) raw -> stored obs (M, D), action (M, U), mean (M, U), log-prob (M,)."""
-        self.obs_norm.collect(torch.nan_to_num(obs))
+    def act(
+        self, obs: Tensor, weight: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """obs (M, D) raw -> stored obs (M, D), action (M, U), mean (M, U), log-prob (M,).
+
+        ``weight`` (M,) of 0 or 1: which rows the observation statistics take in; None for all.
+        """
+        self.obs_norm.collect(torch.nan_to_num(obs), weight)
         stored = self.prepare(obs)
         with self.autocast():
             mean = self.actor(stored)
@@ -244,8 +249,11 @@ class PPO:
 
     # -- learning -------------------------------------------------------------------------------
 
-    def update(self, rollout: Rollout) -> dict[str, Tensor]:
+    def update(self, rollout: Rollout, picks: Tensor | None = None) -> dict[str, Tensor]:
         """Learns from a rollout; the next one may overwrite it. Returns () statistics.
+
+        ``picks``: of its T M samples the indices of those to learn from, always as many (the others
+        must not be ``valid``); None for all.
 
         kl, clip_fraction, policy_loss, value_loss, bounds_loss: means over all minibatches;
         explained_variance: of the returns by the critic before the update.
@@ -254,11 +262,12 @@ class PPO:
         value = self._compute_advantages(rollout)
         self.value_norm.collect(rollout.returns, rollout.valid)
         self.value_norm.commit()
-        self._prepare_batch(rollout, value)
+        size = rollout.steps * rollout.rows if picks is None else len(picks)
+        self._prepare_batch(rollout, value, size)
         self._stats.zero_()
-        size = rollout.steps * rollout.rows
         for _ in range(c.epochs):
             order = torch.randperm(size, device=self.device, generator=self.generator)
+            order = order if picks is None else picks[order]
             for rows in order.split(size // c.minibatches)[: c.minibatches]:
                 self._step(rows)
         self.obs_norm.commit()
@@ -277,14 +286,15 @@ class PPO:
         r.returns.copy_(returns)
         return value
 
-    def _prepare_batch(self, r: Rollout, value: Tensor) -> None:
-        """Flat views (T M, ...) and the quantities that every minibatch needs."""
+    def _prepare_batch(self, r: Rollout, value: Tensor, size: int) -> None:
+        """Flat views (T M, ...) and the quantities that every minibatch of ``size`` picked samples
+        needs."""
         if self._step.graph is not None and self._batch["obs"].data_ptr() != r.obs.data_ptr():
             raise ValueError("the captured update reads the first rollout: fill that one again")
         valid = r.valid.double()
         a = r.advantages.double()
         sums = torch.stack((valid.sum(), (valid * a).sum(), (valid * a * a).sum()))
-        total = float(valid.numel() * self.world_size)
+        total = float(size * self.world_size)
         if self.world_size > 1:
             dist.all_reduce(sums)
         count = sums[0].clamp(min=1.0)

@@ -48,12 +48,14 @@ from rl.imitation import Imitation
 from rl.impact import ImpactCost
 from rl.meter import EpisodeMeter
 from rl.policy import FORMAT as POLICY_FORMAT
-from rl.policy import load_policy
+from rl.policy import read_policy
 from rl.ppo import PPO, STATISTICS
 from rl.profiling import profile_training
 from rl.ranks import over_ranks
 from rl.rollout import collect
 from rl.runlog import Row, RunLog
+from rl.selfplay import SelfPlay
+from rl.warm_start import load_start
 from sports.env import Starts
 from warmstart.atomic import write_text
 from warmstart.clip import Clip
@@ -143,11 +145,8 @@ class _Trainer:
         self.device = pick_device(config.device)
         self.resumed = config.resume and bool(checkpoints(config.out))
         fresh = config.init and not self.resumed
-        policy = load_policy(str(config.init), config.task) if fresh else None
-        if policy is not None and policy.actor is None:
-            raise ValueError(f"--init {config.init} is a baseline: there is nothing to start from")
-        if policy is not None and not config.paper:
-            card = policy.metadata
+        card = read_policy(str(config.init), config.task).metadata if fresh else {}
+        if "hidden" in card and not config.paper:
             shape = {n: card[n] for n in ("hidden", "activation", "observation_clip")}
             shape["hidden"] = tuple(shape["hidden"])
             config = replace(config, ppo=replace(config.ppo, **shape))
@@ -181,24 +180,23 @@ class _Trainer:
         self.cloning: Cloning | None = None
         if config.clone > 0:
             self.cloning = Cloning(self.env, self.agent, Clip.load(config.clips[0]), config.clone)
-        self.samples_each = self.rollout.steps * rows * self.ranks
         self.iteration, self.samples, self.minutes = 0, 0, 0.0
         self.metrics: dict[str, float] = {}
         self.warmup = 0
-        if self.resumed:
-            self.obs = self._restore()
-        else:
-            self.obs = self.env.reset()
-            if policy is not None and policy.actor is not None:  # never a baseline here
-                policy.check(self.env)
-                if policy.layer is not None:
-                    raise ValueError("--init is a latent policy: give --prior as well")
-                count = policy.metadata["obs_count"]
-                self.agent.load_policy(policy.actor, policy.mean, policy.std, count)
-                critic = self.agent.load_critic(policy.extra)
-                self.warmup = 0 if critic else self.hyper.critic_warmup
         # Without any statistics the first rollout is for the observation normaliser only.
         self.first_learning = 0 if config.init or config.task == PRIOR else 1
+        self.unseen: Tensor | None = None
+        """(D,) bool features that the first policy, of another task, has never seen."""
+        if fresh:
+            self._begin_from(str(config.init))
+        self.selfplay: SelfPlay | None = None
+        if config.algo == "selfplay":
+            self.selfplay = SelfPlay(
+                self.env, self.agent, config.selfplay, self.hyper.steps, config.seed
+            )
+        learned = self.selfplay.learned_rows if self.selfplay is not None else rows
+        self.samples_each = self.rollout.steps * learned * self.ranks
+        self.obs = self._restore() if self.resumed else self.env.reset()
 
     def _learner(self) -> Any:
         c = self.config
@@ -208,10 +206,25 @@ class _Trainer:
         sizes = (self.env.obs_size, self.env.action_size)
         return PPO(*sizes, self.hyper, self.device, c.seed, c.cuda_graph, bf16)
 
+    def _begin_from(self, source: str) -> None:
+        """Takes the networks and statistics of another policy."""
+        policy, unseen = load_start(source, self.env, self.config.task)
+        if policy.layer is not None:
+            raise ValueError("--init is a latent policy: give --prior as well")
+        assert policy.actor is not None
+        count = policy.metadata["obs_count"]
+        self.agent.load_policy(policy.actor, policy.mean, policy.std, count)
+        critic = self.agent.load_critic(policy.extra)
+        self.warmup = 0 if critic else self.hyper.critic_warmup
+        if bool(unseen.any()):
+            self.unseen, self.first_learning = unseen.to(self.device), 1
+
     def _watch(self, result: Any) -> None:
         self.meter(result)
         if self.style is not None:
             self.style.watch(result)
+        if self.selfplay is not None:
+            self.selfplay.watch(result)
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -295,6 +308,7 @@ class _Trainer:
     def _iterate(self, began: float, stop_samples: int | None) -> Row:
         """One rollout and its update. Waits for the device once, for the numbers of the row."""
         self._schedule(self._share(stop_samples))
+        learns = self.iteration >= self.first_learning
         clock = Stopwatch(self.device)
         clock.mark()
         self._play()
@@ -330,6 +344,9 @@ class _Trainer:
                 f"learning diverged at iteration {self.iteration} (a loss is not finite): go on "
                 "from the last checkpoint with --resume, or start with a smaller learning rate"
             )
+        contests: Row = {}
+        if self.selfplay is not None:
+            contests |= self.selfplay.settle(self.samples, learns)
         summary = self.meter.summary(totals)
         metrics = {k[8:]: v for k, v in summary.items() if k.startswith("metrics/")}
         self.metrics |= {k: v for k, v in metrics.items() if v is not None and math.isfinite(v)}
@@ -345,6 +362,7 @@ class _Trainer:
             **dict.fromkeys(amp.STATISTICS if self.style is not None else ()),
             **dict.fromkeys((CLONE_ERROR,) if self.cloning is not None else ()),
             **losses_now,
+            **contests,
             **summary,
         }
         return row | counts_now | {k: means_now[k] for k in levels}
@@ -354,7 +372,7 @@ class _Trainer:
         with one_torch_thread(self.env.device):
             self.obs = collect(
                 self.env,
-                self._cloning or self.agent,
+                self._cloning or self.selfplay or self.agent,
                 self.rollout,
                 self.obs,
                 self.hyper.gamma,
@@ -370,9 +388,12 @@ class _Trainer:
     def _learn(self) -> dict[str, Tensor]:
         """Learns from the rollout; returns () statistics."""
         if self.iteration < self.first_learning:
+            if self.unseen is not None:
+                self.agent.obs_norm.adopt(self.unseen)
             self.agent.obs_norm.commit()
             return {}
-        losses = self.agent.update(self.rollout)
+        learn = self.selfplay.learn if self.selfplay is not None else self.agent.update
+        losses = learn(self.rollout)
         losses |= self.style.update() if self.style is not None else {}
         if self._cloning is not None:
             losses |= self._cloning.update(self.rollout, self.iteration)
@@ -475,6 +496,9 @@ class _Trainer:
             tensors |= {f"style/{k}": v for k, v in self.style.state_dict().items()}
         if self.cloning is not None:
             tensors |= {f"cloning/{k}": v for k, v in self.cloning.state_dict().items()}
+        if self.selfplay is not None:
+            state["selfplay"] = self.selfplay.state()
+            tensors |= {f"selfplay/{k}": v for k, v in self.selfplay.state_dict().items()}
         tensors["obs"] = self.obs
         barrier = dist.barrier if self.ranks > 1 else None
         return save_checkpoint(self.config.out, self.iteration, state, tensors, self.rank, barrier)
@@ -495,6 +519,8 @@ class _Trainer:
             self.style.load_state_dict(part("style/"))
         if self.cloning is not None:
             self.cloning.load_state_dict(part("cloning/"))
+        if self.selfplay is not None:
+            self.selfplay.load(state["selfplay"], part("selfplay/"))
         self.iteration, self.samples = state["iteration"], state["samples"]
         self.minutes, self.warmup = state["minutes"], state["warmup"]
         self.metrics = state["card"]["metrics"]
@@ -505,7 +531,8 @@ class _Trainer:
             )
         if self.rank >= saved:  # the worlds of another rank, but not its future
             part_of_run = 1_000_003 * self.rank + self.iteration
-            for k, owner in enumerate((self.agent, self.env, self.style)):
+            owners = (self.agent, self.env, self.style, self.selfplay)
+            for k, owner in enumerate(owners):
                 generator = getattr(owner, "generator", None)
                 if generator is not None:
                     generator.manual_seed(self.config.seed + 7919 * k + part_of_run)

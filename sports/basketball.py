@@ -226,6 +226,7 @@ def advance(view: View, memory: Memory) -> Advance:
         },
         success=counted > 0,
         move=move,
+        outcome=counted,
     )
 
 

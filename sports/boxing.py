@@ -49,7 +49,7 @@ GUARD_Z = 0.9
 
 
 @dataclass(frozen=True)
-class Boxing:
+class Boxing(combat.Options):
     """Options of boxing."""
 
 
@@ -117,6 +117,7 @@ TASK = Task(
         "draw": "fraction",
         "touches_for": "touches",
         "touches_against": "touches",
+        "knock_down": "fraction",
         "fell": "fraction",
         "opponent_fell": "fraction",
     },

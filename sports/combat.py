@@ -40,7 +40,11 @@ CLOSE, APART, HOLDING = 0.6, 0.9, 1.0
 """Horizontal distance of the roots (m) below which athletes are close, that from which they have
 stepped apart, and the seconds of closeness from which they hold each other. Blows are struck from
 0.8 m and more."""
-FACING, VELOCITY, STRIKE, POINT = 0.1, 0.1, 0.6, 1.0
+CREDIT = 1.0
+"""Seconds after a weapon's contact with the opponent for which the opponent's fall is its doing."""
+NEVER = 1e6
+"""Steps since a contact that has not been yet."""
+FACING, VELOCITY, STRIKE = 0.1, 0.1, 0.6
 """Weights of the reward's terms."""
 WANTED_SPEED = 1.0
 """Towards the opponent (m/s); more is not paid."""
@@ -50,6 +54,23 @@ take."""
 ROWS, CONTACTS = 288, 72
 """``Scene.rows_per_world`` and ``contacts_per_world``: twice the most seen in 32 worlds and 300
 steps of two athletes thrashing on top of each other (144, 35); at play it is about 100 and 25."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of both duels. Raises ValueError for a reward below 0."""
+
+    point: float = 1.0
+    """Reward for a point, and cost of the opponent's. The paper's 1 is little beside the up to 0.6
+    of every step in which a weapon is near the opponent."""
+    knock_down: float = 0.0
+    """Reward for the opponent's fall within 1 s after one's own weapon was in contact with it, and
+    cost of such a fall; 0 for the paper's terms alone. A fall without contact earns nothing."""
+
+    def __post_init__(self) -> None:
+        for name in ("point", "knock_down"):
+            if getattr(self, name) < 0.0:
+                raise ValueError(f"the reward '{name}' must not be negative: {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -156,6 +177,7 @@ def begin(view: View, weapons: tuple[Weapon, ...]) -> Memory:
         "squares": squares,
         "wait": nobody.clone(),
         "touches": nobody.clone(),
+        "since_contact": torch.full_like(nobody, NEVER),
         "close_steps": nobody[:, 0].clone(),
         "holding": nobody[:, 0] > 0.0,
     }
@@ -176,8 +198,10 @@ def advance(
 ) -> Advance:
     """One control step of a bout. ``faults`` (N, A) by name: who ended it by a fall or by leaving;
     such an athlete has lost, or whoever leads could end the bout by lying down. Otherwise, and
-    where both did, more touches win. Metrics are those of athlete 0, faults and the opponent's
-    faults among them; success is a bout it won.
+    where both did, more touches win. A fall is a knock-down where a weapon of the opponent was in
+    contact, not in a clinch, within ``CREDIT``: only such a fall earns, and costs, what the task's
+    option says. Metrics are those of athlete 0, faults and the opponent's faults among them;
+    success is a bout it won.
     """
     squares = squared(gaps(view, weapons))
     # The force is the largest of the step's substeps, and the weapon may be off again at its end:
@@ -195,6 +219,10 @@ def advance(
     point = touch & ready & free
     rest = round(REST / view.control_timestep)
     wait = torch.where(point | (contact & ~ready), rest, (wait - 1).clamp(min=0))
+    since_contact = (memory["since_contact"] + 1.0).masked_fill(contact & free, 0.0)
+    recent = since_contact * view.control_timestep <= CREDIT + 1e-6
+    downed = (faults["fell"].flip(1) & recent).float()
+
     scored = point.float()
     touches = memory["touches"] + scored
 
@@ -204,7 +232,8 @@ def advance(
         "facing": FACING * facing,
         "velocity": VELOCITY * velocity,
         "strike": STRIKE * strike,
-        "point": POINT * (scored - scored.flip(1)),
+        "point": view.config.point * (scored - scored.flip(1)),
+        "knock_down": view.config.knock_down * (downed - downed.flip(1)),
     }
 
     mine, theirs = touches.unbind(1)
@@ -217,6 +246,7 @@ def advance(
         "draw": (margin == 0).float(),
         "touches_for": mine,
         "touches_against": theirs,
+        "knock_down": downed[:, 0],
     }
     for name, fault in faults.items():
         metrics[name], metrics[f"opponent_{name}"] = fault.float().unbind(1)
@@ -225,6 +255,7 @@ def advance(
             "squares": squares,
             "wait": wait,
             "touches": touches,
+            "since_contact": since_contact,
             "close_steps": close_steps,
             "holding": holding,
         },
@@ -232,4 +263,5 @@ def advance(
         terminated=ended,
         metrics=metrics,
         success=win,
+        outcome=margin.sign(),
     )

@@ -53,6 +53,9 @@ class StepResult:
     """(N,) steps for which this step's reward is paid on (0 for most)."""
     metrics: dict[str, Tensor]
     """(N,) episode metrics, to be read where the episode ended."""
+    outcome: Tensor | None = None
+    """(N,) of a contest 1, 0 or -1: side 0 (the first half of the agents) has won, drawn or lost,
+    to be read where the episode ended. None for a task without sides."""
 
     @property
     def ended(self) -> Tensor:
@@ -235,6 +238,7 @@ class Env:
             valid=valid,
             remaining_paid=remaining,
             metrics=step.metrics,
+            outcome=step.outcome,
         )
 
     def _reset(self, mask: Tensor) -> None:

@@ -48,7 +48,7 @@ GUARD_Z = 0.9
 
 
 @dataclass(frozen=True)
-class Fencing:
+class Fencing(combat.Options):
     """Options of fencing."""
 
 
@@ -101,6 +101,7 @@ TASK = Task(
         "draw": "fraction",
         "touches_for": "touches",
         "touches_against": "touches",
+        "knock_down": "fraction",
         "fell": "fraction",
         "opponent_fell": "fraction",
         "out": "fraction",

@@ -294,6 +294,7 @@ def advance(view: View, memory: Memory) -> Advance:
         },
         success=counted > 0,
         move=move,
+        outcome=counted,
     )
 
 

@@ -240,6 +240,7 @@ def _duel(
         terminated=lost.any(-1, keepdim=True).expand(-1, 2),
         metrics=metrics,
         success=won[:, 0],
+        outcome=points_for - points_against,
     )
 
 

@@ -133,6 +133,9 @@ class Advance:
     """(N,) bool: the world begins anew without an outcome: bootstrap, as at the time limit."""
     move: Move | None = None
     """Done after the step, before it is observed; not where the world begins anew."""
+    outcome: Tensor | None = None
+    """(N,) float of a contest: 1 where side 0 (the first half of the athletes) has won by the
+    sport's own score if the episode ends here, -1 where side 1 has, 0 for a draw."""
 
 
 @dataclass(frozen=True)

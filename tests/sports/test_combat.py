@@ -427,3 +427,47 @@ def test_a_blow_scores_once(task, engine):
     results = list(bout.play(8))
     assert sum(float(r.terms["point"][0, 0]) for r in results) == 1.0
     assert results[-1].metrics["touches_against"][0] == 0.0
+
+
+@pytest.mark.parametrize("agent", [0, 1])
+@pytest.mark.parametrize(
+    ("newtons", "wait", "credited"), [(1.0, 0, 1.0), (1.0, 29, 1.0), (1.0, 30, 0.0), (0.0, 0, 0.0)]
+)
+def test_a_fall_is_credited_within_a_second_of_contact(task, agent, newtons, wait, credited):
+    """Contact of the other's weapon in one step, then ``wait`` steps, then the fall: 30 Hz."""
+    bout = Bout(task)
+    bout.env.view.config = type(bout.env.view.config)(knock_down=2.0)
+    bout.begin()
+    bout.step((1 - agent, newtons))
+    for _ in range(wait):
+        bout.step()
+    step = bout.step(ground={(agent, "L_Hand"): 51.0})
+    assert step.terminated[0, agent]
+    gain = 2.0 * credited * (1.0 if agent == 1 else -1.0)
+    assert step.terms["knock_down"][0].tolist() == [gain, -gain]
+    assert step.metrics["knock_down"][0] == credited * (agent == 1)
+    assert step.outcome is not None and step.outcome[0] == (1.0 if agent == 1 else -1.0)
+
+
+def test_a_contact_in_a_clinch_brings_no_credit(task):
+    bout = Bout(task)
+    bout.env.view.config = type(bout.env.view.config)(knock_down=2.0)
+    bout.begin()
+    bout.env.memory["holding"][:] = True
+    bout.place(0, -0.4, pose={})
+    bout.place(1, 0.4, yaw=math.pi, pose={})
+    bout.step((0, 500.0))
+    step = bout.step(ground={(1, "L_Hand"): 51.0})
+    assert step.terms["knock_down"].abs().sum() == 0.0
+
+
+def test_rewards_as_the_options_say(task):
+    bout = Bout(task)
+    config = type(bout.env.view.config)
+    bout.env.view.config = config(point=5.0)
+    bout.reach_out(0.2)
+    bout.begin()
+    assert bout.step((0, 500.0)).terms["point"][0].tolist() == [5.0, -5.0]
+    for name in ("point", "knock_down"):
+        with pytest.raises(ValueError, match=f"'{name}' must not be negative"):
+            config(**{name: -1.0})

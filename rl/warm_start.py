@@ -1,0 +1,103 @@
+"""Starting a task from a policy of another: weights follow the names of what they look at.
+
+An actor reads slices of an observation with names (``body_pos``, ``goal/ball``, ...). A policy for
+one athlete, against a machine or nobody, becomes one for a contest: the columns of its first layer
+go to the slices of the same names, and those of slices it has never seen, such as the opponent,
+are zero. In the beginning it therefore plays as before, whatever the opponent does. Where actions
+are around another pose, its last layer is made to ask for the same joint angles.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from rl.config import TRACKING
+from rl.networks import MLP
+from rl.policy import Policy, PolicyError, read_policy
+from sports.env import make_scene
+from sports.registry import task_names
+
+ALIASES: dict[str, tuple[str, ...]] = {
+    "goal/other_goal": ("goal/goal",),
+    "goal/ball_position": ("goal/ball_pos",),
+    "goal/ball_rotation": ("goal/ball_rot",),
+    "goal/ball_velocity": ("goal/ball_linvel", "goal/ball_angvel"),
+}
+"""What other tasks call the same thing, or its parts in order."""
+
+
+def load_start(source: str, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
+    """A policy to begin training with, and (D,) bool the features that it has never seen.
+
+    A policy of the task itself is returned as it is. One of another task must move the same body
+    with the same actions; its card then says the task and layout of the environment.
+    Raises PolicyError for a policy that cannot be used.
+    """
+    policy = read_policy(source, task)
+    found = policy.metadata["task"]
+    if policy.actor is None:
+        raise ValueError(f"--init {source} is a baseline: there is nothing to start from")
+    if found == task:
+        policy.check(env)
+        return policy, torch.zeros(env.obs_size, dtype=torch.bool)
+    _same_athlete(policy, env, task, source)
+    return _moved(policy, env, task)
+
+
+def _same_athlete(policy: Policy, env: Any, task: str, source: str) -> None:
+    """Raises PolicyError where an action would mean another thing."""
+    card = policy.metadata
+    found, body = card["task"], getattr(env.task, "body", "none")
+    where = f"the policy '{source}' of task '{found}' cannot start '{task}'"
+    if card["body"] != body:
+        raise PolicyError(f"{where}: its body is '{card['body']}', not '{body}'")
+    if card["action_size"] != env.action_size:
+        raise PolicyError(
+            f"{where}: it has {card['action_size']} actions, the task {env.action_size}"
+        )
+    if not isinstance(card.get("obs_layout"), dict):
+        raise PolicyError(f"{where}: its card does not say what it observes")
+    if TRACKING in (found, task):
+        raise PolicyError(f"{where}: actions of '{TRACKING}' are around the clips' poses")
+
+
+def _moved(policy: Policy, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
+    assert policy.actor is not None
+    card, layout = policy.metadata, policy.metadata["obs_layout"]
+    columns = torch.full((env.obs_size,), -1)
+    """Column of the policy for each feature; -1 for none."""
+    for name, own in env.obs_slices.items():
+        parts = (name,) if name in layout else ALIASES.get(name, ())
+        spans = [range(*layout[part]) for part in parts if part in layout]
+        known = [column for span in spans for column in span]
+        if len(known) == own.stop - own.start:
+            columns[own] = torch.tensor(known)
+    new = columns < 0
+    if bool(new.all()):
+        raise PolicyError(
+            f"the policy of task '{card['task']}' and task '{task}' observe nothing in common"
+        )
+    old = columns.clamp(min=0)
+    weights = dict(policy.actor.state_dict())
+    weights["trunk.0.weight"] = weights["trunk.0.weight"][:, old].masked_fill(new, 0.0)
+    if card["task"] in task_names() and getattr(env, "layer", None) is None:
+        # The same PD targets: offset + scale a of one task in terms of the other's.
+        scene = make_scene(card["task"], limits=card["limits"])
+        offset, scale = (
+            torch.as_tensor(x, dtype=torch.float32, device=env.device)
+            for x in (scene.action_offset(), scene.body.action_scale())
+        )
+        ratio = (scale / env.action_scale).cpu()
+        shift = ((offset - env.action_offset) / env.action_scale).cpu()
+        weights["head.weight"] = ratio[:, None] * weights["head.weight"]
+        weights["head.bias"] = ratio * weights["head.bias"] + shift
+    sizes = (env.obs_size, tuple(card["hidden"]), card["action_size"])
+    actor = MLP(*sizes, card["activation"])
+    actor.load_state_dict(weights)
+    layout = {k: [s.start, s.stop] for k, s in env.obs_slices.items()}
+    card = {**card, "task": task, "obs_size": env.obs_size, "obs_layout": layout}
+    mean = policy.mean[old].masked_fill(new, 0.0)
+    std = policy.std[old].masked_fill(new, 1.0)
+    return Policy(actor.requires_grad_(False), mean, std, card), new

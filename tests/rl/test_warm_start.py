@@ -1,0 +1,189 @@
+"""Starts from policies of other tasks: same actions, blind to the opponent, refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from rl.checkpoint import checkpoints, load_checkpoint
+from rl.networks import MLP
+from rl.normalizer import Normalizer
+from rl.policy import FORMAT, PolicyError
+from rl.ppo import PPOConfig
+from rl.train import TrainConfig, train
+from rl.warm_start import load_start
+from sports.env import make_env
+from tests.rl.contest import Contest
+from warmstart.atomic import write_json
+
+HIDDEN = (8, 8)
+
+
+def policy_file(folder: Path, of: str, **changes: object) -> str:
+    """A made-up policy of a task, with statistics of its own, as a file."""
+    import hashlib
+
+    env = make_env(of, num_worlds=1)
+    g = torch.Generator().manual_seed(5)
+    actor = MLP(env.obs_size, HIDDEN, env.action_size, "silu", 1.0, g)
+    path = folder / f"{of}.safetensors"
+    save_file(dict(actor.state_dict()), path)
+    card = {
+        "format": FORMAT,
+        "task": of,
+        "algo": "ppo",
+        "body": env.task.body,
+        "strength": "paper",
+        "limits": "paper",
+        "obs_size": env.obs_size,
+        "action_size": env.action_size,
+        "obs_layout": {k: [s.start, s.stop] for k, s in env.obs_slices.items()},
+        "hidden": list(HIDDEN),
+        "activation": "silu",
+        "observation_clip": 5.0,
+        "obs_mean": torch.randn(env.obs_size, generator=g).tolist(),
+        "obs_std": (0.5 + torch.rand(env.obs_size, generator=g)).tolist(),
+        "obs_count": 1000.0,
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        **changes,
+    }
+    write_json(path.with_suffix(".json"), card)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("solo", "duel", "opponent"),
+    [
+        ("tennis", "tennis_1v1", 9),
+        ("table_tennis", "table_tennis_1v1", 9),
+        ("soccer_1v1", "soccer_2v2", 30),
+    ],
+)
+def test_it_acts_as_before_whatever_the_opponent_does(tmp_path, solo, duel, opponent):
+    source = policy_file(tmp_path, solo)
+    own, env = make_env(solo, num_worlds=1), make_env(duel, num_worlds=2, seed=1)
+    before, unseen = load_start(source, own, solo)
+    assert not unseen.any()
+    policy, unseen = load_start(source, env, duel)
+    assert int(unseen.sum()) == opponent == env.obs_size - own.obs_size
+    obs = env.reset()[0, 0] + 0.1
+    narrow = torch.zeros(own.obs_size)
+    for name, at in own.obs_slices.items():
+        narrow[at] = obs[env.obs_slices[name]]
+    assert (policy(obs) - before(narrow)).abs().max() < 1e-6
+    other = obs.clone()
+    other[unseen] += 3.0
+    assert torch.equal(policy(other), policy(obs))
+    policy.check(env)
+
+
+def test_other_names_for_the_same_thing(tmp_path):
+    """A kicker's goal is the other goal of a match; a thrower's ball has its velocities apart."""
+    for solo, duel, pairs in (
+        ("penalty_kick", "soccer_1v1", {"goal/other_goal": "goal/goal"}),
+        ("free_throw", "basketball_1v1", {"goal/ball_position": "goal/ball_pos"}),
+    ):
+        env, own = make_env(duel, num_worlds=1), make_env(solo, num_worlds=1)
+        policy, unseen = load_start(policy_file(tmp_path, solo), env, duel)
+        card = json.loads((tmp_path / f"{solo}.json").read_text())
+        for name, old in pairs.items():
+            assert not unseen[env.obs_slices[name]].any()
+            told = policy.mean[env.obs_slices[name]].tolist()
+            assert told == pytest.approx(card["obs_mean"][own.obs_slices[old]])
+        velocity = env.obs_slices["goal/ball_velocity"]
+        assert not unseen[velocity].any()
+        assert unseen[env.obs_slices["goal/opponent1_position"]].all()
+
+
+def test_the_same_joint_angles_are_asked_for_around_another_guard(tmp_path):
+    source = policy_file(tmp_path, "fencing")
+    fencing, boxing = make_env("fencing", num_worlds=1), make_env("boxing", num_worlds=1)
+    assert (fencing.action_offset - boxing.action_offset).abs().max() > 0.5
+    before, _ = load_start(source, fencing, "fencing")
+    policy, _ = load_start(source, boxing, "boxing")
+    narrow, obs = torch.zeros(fencing.obs_size), boxing.reset()[0, 0]
+    for name, at in fencing.obs_slices.items():
+        own = boxing.obs_slices.get(name)
+        if own is not None and own.stop - own.start == at.stop - at.start:
+            narrow[at] = obs[own]
+        else:  # what a boxer does not see is at its mean
+            narrow[at] = before.mean[at]
+    angles = fencing.action_offset + fencing.action_scale * before(narrow)
+    same = boxing.action_offset + boxing.action_scale * policy(obs)
+    torch.testing.assert_close(same, angles, rtol=1e-5, atol=1e-5)
+
+
+def test_another_athlete_is_refused_with_a_sentence(tmp_path):
+    boxing = make_env("boxing", num_worlds=1)
+    with pytest.raises(PolicyError, match="its body is 'smplx', not 'smpl'"):
+        load_start(policy_file(tmp_path, "free_throw"), boxing, "boxing")
+    with pytest.raises(PolicyError, match="are around the clips' poses"):
+        tracker = policy_file(tmp_path, "boxing", task="tracking")
+        load_start(tracker, boxing, "boxing")
+    with pytest.raises(PolicyError, match="has 69 actions, the task 1"):
+        contest = Contest(2)
+        contest.task.body = "smpl"
+        load_start(policy_file(tmp_path, "tennis"), contest, "contest")
+    with pytest.raises(PolicyError, match="does not say what it observes"):
+        source = policy_file(tmp_path, "tennis", obs_layout=None)
+        load_start(source, make_env("tennis_1v1", num_worlds=1), "tennis_1v1")
+    with pytest.raises(ValueError, match="baseline"):
+        load_start("zero", boxing, "boxing")
+
+
+def test_new_features_take_the_statistics_of_what_is_seen_first():
+    """Against numpy's mean and variance; known features merge as they always do."""
+    g = torch.Generator().manual_seed(0)
+    seen = 3.0 + 2.0 * torch.randn(500, 4, generator=g)
+    columns = torch.tensor([False, True, False, True])
+    norm, plain = Normalizer(4), Normalizer(4)
+    for n in (norm, plain):
+        n.set_moments(1e6, torch.tensor([0.0, 9.0, 1.0, 9.0]), torch.tensor([1.0, 7.0, 2.0, 7.0]))
+        n.collect(seen)
+    norm.adopt(columns)
+    norm.commit()
+    plain.commit()
+    assert torch.equal(norm.mean[~columns], plain.mean[~columns])
+    assert torch.equal(norm.std[~columns], plain.std[~columns])
+    expected = seen.double()[:, columns]
+    torch.testing.assert_close(norm.mean[columns].double(), expected.mean(0), rtol=1e-6, atol=1e-6)
+    spread = (expected.var(0, unbiased=False) + norm.epsilon).sqrt()
+    torch.testing.assert_close(norm.std[columns].double(), spread, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("algo", ["ppo", "selfplay"])
+def test_a_run_begins_with_it(tmp_path, algo):
+    """With rate 0 the weights stay; the first rollout only shows the opponent's features."""
+    small = PPOConfig(steps=4, minibatches=1, epochs=1, learning_rate=0.0, kl_band=None)
+    source = policy_file(tmp_path, "tennis")
+    run = TrainConfig(task="tennis_1v1", algo=algo, worlds=8, init=source, quiet=True, ppo=small)
+    run = TrainConfig(**{**vars(run), "out": tmp_path / "run", "samples": 2 * 4 * 16})
+    if algo == "selfplay":
+        from rl.selfplay import SelfPlayConfig
+
+        few = SelfPlayConfig(pool=4, ladder=(1000,))
+        run = TrainConfig(**{**vars(run), "selfplay": few, "samples": 2 * 4 * 12})
+    train(run)
+    tensors = load_checkpoint(checkpoints(tmp_path / "run")[-1])[1]
+    env = make_env("tennis_1v1", num_worlds=1)
+    policy, unseen = load_start(source, env, "tennis_1v1")
+    assert policy.actor is not None
+    for name, x in policy.actor.state_dict().items():
+        assert torch.equal(tensors[f"agent/actor.{name}"], x)
+    count, mean = (
+        tensors["agent/obs_norm.total"][0],
+        tensors["agent/obs_norm.total"][1:][: len(unseen)],
+    )
+    assert float(count) == 1000.0 + run.samples  # type: ignore[operator]
+    # The opponent is 26 m away, behind the net: the mean of its place is not that of nothing.
+    ahead = env.obs_slices["goal/opponent"].start
+    assert float(mean[ahead]) > 20.0
+    if algo == "selfplay":
+        assert torch.equal(
+            tensors["selfplay/stack.mean"][0, 0, ahead], tensors["selfplay/stack.mean"][3, 0, ahead]
+        )
+        assert float(tensors["selfplay/stack.mean"][0, 0, ahead]) > 20.0
