@@ -7,6 +7,11 @@ different, too. So for the first iterations of a run half of the worlds play the
 targets with the policy's noise, half play the actor (DAgger, Ross et al. 2011: the states that it
 gets itself into), and all are labelled with the targets of their step. The actor learns the labels,
 the critic learns from the task's rewards as ever.
+
+What a hand does in a throw is timing alone, and noise spoils what reinforcement learns of it: a
+javelin thrower that is paid for each metre holds on until the noise of its fingers shakes the
+javelin loose, and without noise never lets go. ``fingers`` keeps the fingers at the
+demonstration's targets for the whole run; the rest of the body learns by reward.
 """
 
 from __future__ import annotations
@@ -20,6 +25,7 @@ from torch import Tensor
 
 from rl.ppo import PPO, gaussian_log_prob
 from rl.rollout import Rollout
+from sports.humanoid.body import FINGERS
 from warmstart.bank import START, elapsed
 from warmstart.clip import Clip
 
@@ -59,12 +65,17 @@ def reference(clip: Clip, env: Any) -> Tensor:
 class Cloning:
     """An actor (see ``rl.rollout.Actor``) that plays and labels; ``update`` learns the labels."""
 
-    def __init__(self, env: Any, agent: PPO, clip: Clip, iterations: int) -> None:
+    def __init__(
+        self, env: Any, agent: PPO, clip: Clip, iterations: int, fingers: bool = False
+    ) -> None:
         """Args:
         env: of one athlete a world.
         agent: whose actor learns.
         clip: a whole episode from the task's own start; see :func:`reference`.
         iterations: how long, for the learning rate.
+        fingers: they go on learning their labels afterwards.
+
+        Raises ValueError for a task of several athletes and for fingers that the body has not.
         """
         if env.num_agents != 1:
             raise ValueError("cloning is for tasks of one athlete")
@@ -73,6 +84,17 @@ class Cloning:
         self.actions = reference(clip, env).to(self.device)
         self.led = torch.arange(env.num_worlds, device=self.device) < LED * env.num_worlds
         self.optimizer = torch.optim.Adam(agent.actor.parameters(), lr=RATES[0])
+        self.leading = True
+        """Whether the demonstration is played, or only its fingers' labels are kept in mind."""
+        self.fingers: Tensor | None = None
+        if fingers:
+            own = tuple(f"{side}_{finger}" for side in "LR" for finger in FINGERS)
+            dofs = env.physics.scene.body.dofs
+            found = [i for i, dof in enumerate(dofs) if dof.link.startswith(own)]
+            if not found:
+                raise ValueError("the task's body has no fingers whose targets could be kept")
+            self.fingers = torch.tensor(found, device=self.device)
+        self._labels: list[Tensor] = []
 
     def labels(self) -> Tensor:
         """(N, act) the demonstration's actions at the worlds' control steps; after its end the
@@ -88,21 +110,34 @@ class Cloning:
     def act(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """obs (M, D) raw -> stored obs, action, label (in the mean's place), log-prob of the action
         by the actor: the critic's update, which comes first, then finds ratios of 1."""
-        stored, action, mean, _ = self.agent.act(obs)
+        stored, action, mean, log_prob = self.agent.act(obs)
+        if not self.leading:
+            self._labels.append(self.labels())
+            return stored, action, mean, log_prob
         label, noise = self.labels(), action - mean
         action = torch.where(self.led[:, None], label, mean) + noise
         return stored, action, label, gaussian_log_prob(action, mean, self.agent.sigma)
 
     def update(self, rollout: Rollout, done: int) -> dict[str, Tensor]:
-        """Learns the labels of a rollout; ``done`` iterations of cloning were before. Returns the
-        error before it learned from them."""
-        c, share = self.agent.config, done / max(self.iterations, 1)
+        """Learns the labels of a rollout, after its turn those of the fingers alone; ``done``
+        iterations were before. Returns the error before it learned from them."""
+        c, share = self.agent.config, min(done / max(self.iterations, 1), 1.0)
         for group in self.optimizer.param_groups:
             group["lr"] = RATES[0] * (RATES[1] / RATES[0]) ** share
         obs, label = rollout.obs.flatten(0, 1), rollout.mean.flatten(0, 1)
+        epochs = c.epochs
+        if not self.leading and self.fingers is not None:
+            # The other joints stay where the actor has them now.
+            with torch.no_grad(), self.agent.autocast():
+                label = torch.cat(
+                    [self.agent.actor(x) for x in obs.split(len(obs) // c.minibatches)]
+                )
+            kept = torch.stack(self._labels).flatten(0, 1)
+            label[:, self.fingers], epochs = kept[:, self.fingers], 1
+        self._labels.clear()
         weight = rollout.valid.flatten().float()
         error, size = torch.zeros((), device=self.device), len(obs)
-        for epoch in range(c.epochs):
+        for epoch in range(epochs):
             order = torch.randperm(size, device=self.device, generator=self.agent.generator)
             for rows in order.split(size // c.minibatches)[: c.minibatches]:
                 with self.agent.autocast():

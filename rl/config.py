@@ -96,6 +96,8 @@ class TrainConfig:
     clone: int = 0
     """Iterations at the beginning in which the actor learns the targets of the one clip in
     ``clips``, a whole episode of the task (``rl/cloning.py``)."""
+    clone_fingers: bool = False
+    """The fingers go on learning the clip's targets for the whole run."""
     impact: float = 0.0
     """Cost per step of each body weight by which the ground's force on a link exceeds
     ``impact_limit``: keeps motion off the hard impacts in which engines differ."""
@@ -137,6 +139,8 @@ class TrainConfig:
             raise ValueError(f"start_probability must lie in [0, 1], not {self.start_probability}")
         if self.clone < 0:
             raise ValueError(f"clone must not be negative: {self.clone}")
+        if self.clone_fingers and not self.clone:
+            raise ValueError("--clone-fingers is for a run that clones: give --clone as well")
         if self.clone and len(self.clips) != 1:
             raise ValueError("cloning needs one clip of a whole episode: give it with --clips")
         if self.clone and (self.prior is not None or self.task == PRIOR):

@@ -179,7 +179,8 @@ class _Trainer:
             )
         self.cloning: Cloning | None = None
         if config.clone > 0:
-            self.cloning = Cloning(self.env, self.agent, Clip.load(config.clips[0]), config.clone)
+            clip, fingers = Clip.load(config.clips[0]), config.clone_fingers
+            self.cloning = Cloning(self.env, self.agent, clip, config.clone, fingers)
         self.iteration, self.samples, self.minutes = 0, 0, 0.0
         self.metrics: dict[str, float] = {}
         self.warmup = 0
@@ -401,8 +402,12 @@ class _Trainer:
 
     @property
     def _cloning(self) -> Cloning | None:
-        """In the first iterations of a run that clones."""
-        return self.cloning if self.iteration < self.config.clone else None
+        """In the first iterations of a run that clones, and always where fingers stay cloned."""
+        if self.cloning is not None:
+            self.cloning.leading = self.iteration < self.config.clone
+            if self.cloning.leading or self.config.clone_fingers:
+                return self.cloning
+        return None
 
     def _number(self, x: Tensor | int) -> Tensor:
         """(1,) float64 on the learner's device."""

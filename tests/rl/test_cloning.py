@@ -15,6 +15,7 @@ from rl.ppo import PPO, PPOConfig
 from rl.rollout import collect
 from rl.train import TrainConfig, train
 from sports.env import make_env
+from sports.humanoid.body import FINGERS
 from warmstart.bank import thrown_files
 from warmstart.clip import Clip
 
@@ -160,3 +161,51 @@ def test_a_run_stopped_while_it_clones_goes_on_bit_for_bit(tmp_path: Path):
     assert any(k.startswith("cloning/") for k in whole)
     for name, x in whole.items():
         torch.testing.assert_close(parts[name], x, rtol=0, atol=0, equal_nan=True, msg=name)
+
+
+def test_fingers_go_on_learning_their_labels_while_other_joints_stay(env, clip):
+    """After the cloning: the rest of the body is where the actor has it, nobody plays the clip."""
+    agent = PPO(env.obs_size, env.action_size, SMALL, "cpu", 0)
+    learner = Cloning(env, agent, clip, 0, fingers=True)
+    learner.leading = False
+    rollout = agent.new_rollout(env.num_worlds)
+    obs, names = env.reset(), env.physics.scene.body.dofs
+    for _ in range(2):
+        obs = collect(env, learner, rollout, obs, 0.99)
+        labels = torch.stack(learner._labels)
+        agent.obs_norm.commit()
+        if _ == 0:
+            learner._labels.clear()
+    played = reference(clip, env)
+    # The first step of the second rollout is number 6 of the episode (nobody has lost it yet).
+    assert torch.equal(labels[0], played[6].expand(4, -1))
+    fingers = [i for i, dof in enumerate(names) if dof.link[2:].startswith(FINGERS)]
+    others = [i for i in range(len(names)) if i not in fingers]
+    assert len(fingers) == 90 and learner.fingers.tolist() == fingers
+
+    def error(joints: list[int], target: torch.Tensor) -> float:
+        with torch.no_grad():
+            return float((agent.actor(rollout.obs) - target)[..., joints].square().mean().sqrt())
+
+    with torch.no_grad():
+        before = agent.actor(rollout.obs).clone()
+    first = error(fingers, labels)
+    for _ in range(20):
+        learner._labels[:] = list(labels)
+        learner.update(rollout, 0)
+    moved = float((before - labels)[..., others].square().mean().sqrt())
+    assert error(fingers, labels) < 0.7 * first
+    assert error(others, before) < 0.2 * moved
+    assert (rollout.mean - labels).abs().max() > 0.1  # the mean, not the label, is what PPO sees
+
+
+def test_a_body_without_fingers_has_none_to_keep(clip):
+    other = make_env("long_jump", num_worlds=2, physics_options={"threads": 1})
+    body = Clip(30.0, "smpl", *(x[:, : k + 69] for x, k in ((clip.qpos, 7), (clip.qvel, 6))))
+    whole = replace(body, ctrl=np.zeros((clip.num_frames, 69)), meta={"events": {"start": 0.0}})
+    agent = PPO(other.obs_size, other.action_size, SMALL, "cpu", 0)
+    with pytest.raises(ValueError, match="no fingers"):
+        Cloning(other, agent, whole, 1, fingers=True)
+    other.close()
+    with pytest.raises(ValueError, match="--clone as well"):
+        TrainConfig(task="javelin", clips=(THROW,), clone_fingers=True)
