@@ -19,6 +19,13 @@ from torch import Tensor, nn
 from rl.graph import GraphedStep
 from rl.networks import MLP, Activation
 from rl.normalizer import Normalizer
+from rl.ppo_losses import (
+    bounds_excess,
+    clipped_value_error,
+    gaussian_divergence,
+    gaussian_log_prob,
+    surrogate_loss,
+)
 from rl.ranks import SharedGradients, SharedStep
 from rl.rollout import Rollout, generalized_advantages
 
@@ -109,19 +116,6 @@ PAPER = replace(
 """Hyper-parameters of the SMPLOlympics paper (arXiv 2407.00187); run it with 2048 worlds."""
 
 
-def gaussian_log_prob(action: Tensor, mean: Tensor, sigma: Tensor) -> Tensor:
-    """(...) log density of action (..., U) under N(mean, sigma^2), float32."""
-    z = (action - mean) / sigma
-    constant = action.shape[-1] * (sigma.log() + 0.5 * math.log(2.0 * math.pi))
-    return -0.5 * z.square().sum(-1) - constant
-
-
-def surrogate_loss(ratio: Tensor, advantage: Tensor, clip_ratio: float) -> Tensor:
-    """(...) -min(ratio A, clip(ratio) A). Source: Schulman et al. 2017, eq. 7."""
-    clipped = ratio.clamp(1.0 - clip_ratio, 1.0 + clip_ratio)
-    return -torch.minimum(ratio * advantage, clipped * advantage)
-
-
 def adapted_rate(rate: Tensor, kl: Tensor, config: PPOConfig) -> Tensor:
     """() learning rate after a minibatch of divergence ``kl``, on the device."""
     if config.kl_band is None:
@@ -208,6 +202,12 @@ class PPO:
         outputs = self.actor.head.out_features
         inputs = self.obs_norm.mean.numel()
         return Rollout(c.steps, rows, inputs, outputs, self.device, self.obs_dtype)
+
+    def schedule(self, share: float) -> None:
+        """Sets sigma for the part of the run that is done, 0..1."""
+        c = self.config
+        if c.sigma_final is not None:
+            self.sigma.fill_(c.sigma * (c.sigma_final / c.sigma) ** share)
 
     # -- acting ---------------------------------------------------------------------------------
 
@@ -335,17 +335,13 @@ class PPO:
             value = self.critic(b["obs"]).squeeze(-1)
         ratio = (gaussian_log_prob(b["action"], mean, self.sigma) - b["log_prob"]).exp()
         policy_loss = (weight * surrogate_loss(ratio, b["advantage"], c.clip_ratio)).mean()
-        bounds_loss = (weight * (mean.abs() - 1.0).clamp(min=0.0).square().sum(-1)).mean()
-        error = (value - b["target"]).square()
-        if c.value_clip is not None:
-            moved = b["value"] + (value - b["value"]).clamp(-c.value_clip, c.value_clip)
-            error = torch.maximum(error, (moved - b["target"]).square())
+        bounds_loss = (weight * bounds_excess(mean)).mean()
+        error = clipped_value_error(value, b["target"], b["value"], c.value_clip)
         value_loss = (weight * error).mean()
         actor_loss = policy_loss + c.bounds_coefficient * bounds_loss
         (self.actor_weight * actor_loss + c.critic_coefficient * value_loss).backward()
         with torch.no_grad():
-            divergence = (mean - b["mean"]).square().sum(-1) / (2.0 * self.sigma.square())
-            kl = (weight * divergence).mean()
+            kl = (weight * gaussian_divergence(mean, b["mean"], self.sigma)).mean()
             clipped = (weight * ((ratio - 1.0).abs() > c.clip_ratio)).mean()
             return torch.stack((kl, clipped, policy_loss, value_loss, bounds_loss))
 
