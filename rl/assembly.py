@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 from rl import latent_run
@@ -23,6 +22,7 @@ from rl.meter import EpisodeMeter
 from rl.parts import ImitationReward, Impacts, Lesson, Opponents, Part, Style
 from rl.policy import read_policy
 from rl.ppo import PPO, STATISTICS
+from rl.ranks import own_rank
 from rl.rollout import Rollout
 from rl.warm_start import load_start
 from sports.env import Env, Starts, make_env
@@ -67,9 +67,7 @@ def assemble(config: TrainConfig, starts: Starts | None, make: MakeEnv) -> Assem
 
     Raises ValueError for settings that cannot be, PolicyError for ``init``.
     """
-    ranked = dist.is_initialized()
-    rank = dist.get_rank() if ranked else 0
-    ranks = dist.get_world_size() if ranked else 1
+    rank, ranks = own_rank()
     device = pick_device(config.device)
     resumed = config.resume and bool(checkpoints(config.out))
     first = None if resumed else config.init
