@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -23,13 +23,44 @@ from rl.parts import ImitationReward, Impacts, Lesson, Opponents, Part, Style
 from rl.policy import read_policy
 from rl.ppo import PPO, STATISTICS
 from rl.ranks import own_rank
-from rl.rollout import Rollout
+from rl.rollout import Actor, Rollout
 from rl.warm_start import load_start
 from sports.env import Env, Starts, make_env
 from sports.physics.variation import Variation
 
 MakeEnv = Callable[[TrainConfig, int], Any]
 """(config, seed) -> environment."""
+
+
+class Learner(Actor, Protocol):
+    """What the loop needs of a learner: a PPO, or the Distiller of the task ``prior``."""
+
+    obs_norm: Any
+    """Normaliser of observations."""
+    sigma: Tensor
+    learning_rate: Tensor
+    actor_weight: Tensor
+    """() set to 0 while the actor rests, else to 1."""
+
+    def new_rollout(self, rows: int) -> Rollout:
+        """Storage for ``rows`` = worlds x agents. Raises ValueError for too few."""
+        ...
+
+    def schedule(self, share: float) -> None:
+        """Sets its hyper-parameters for the part of the run that is done, 0..1."""
+        ...
+
+    def update(self, rollout: Rollout) -> dict[str, Tensor]:
+        """Learns from a rollout; returns () statistics."""
+        ...
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that decides the next update, by name."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Takes a state back. Raises ValueError where it does not fit."""
+        ...
 
 
 @dataclass
@@ -43,8 +74,7 @@ class Assembly:
     device: torch.device
     """Of the learner."""
     env: Any
-    agent: Any
-    """The learner: a PPO, or what stands in its place for the task ``prior``."""
+    agent: Learner
     rollout: Rollout
     meter: EpisodeMeter
     parts: list[Part]
@@ -54,11 +84,11 @@ class Assembly:
     """Of the log, empty in rows of iterations that do not learn."""
     resumed: bool
     """Whether there is a checkpoint to go on from."""
-    warmup: int = 0
+    warmup: int
     """Iterations in which only the critic learns."""
-    first_learning: int = 0
+    first_learning: int
     """Iterations before anything learns: they show observations to the normaliser."""
-    unseen: Tensor | None = None
+    unseen: Tensor | None
     """(D,) bool features that the first policy, of another task, has never seen."""
 
 
@@ -88,36 +118,40 @@ def assemble(config: TrainConfig, starts: Starts | None, make: MakeEnv) -> Assem
     if config.prior is not None:
         latent_run.act_through_prior(env, config)
     agent = _learner(config, env, device)
-    rows = env.num_worlds * env.num_agents
-    made = Assembly(
+    learned = env.num_worlds * env.num_agents
+    rollout = agent.new_rollout(learned)
+    if config.styled:
+        parts.append(Style(config, env, agent))
+    if config.clone > 0:
+        parts.append(Lesson(config, env, agent))
+    # Without any statistics the first rollout is for the observation normaliser only.
+    first_learning = 0 if config.init or config.task == PRIOR else 1
+    warmup, unseen = 0, None
+    if first:
+        warmup, unseen = _begin_from(first, config, env, agent)
+        first_learning = 0 if unseen is None else 1
+    if config.algo == "selfplay":
+        opponents = Opponents(config, env, agent)
+        parts.append(opponents)
+        learned = opponents.play.learned_rows
+    columns = () if config.task == PRIOR else STATISTICS
+    return Assembly(
         config=config,
         rank=rank,
         ranks=ranks,
         device=device,
         env=env,
         agent=agent,
-        rollout=agent.new_rollout(rows),
+        rollout=rollout,
         meter=EpisodeMeter(env),
         parts=parts,
-        samples_each=0,
-        columns=() if config.task == PRIOR else STATISTICS,
+        samples_each=rollout.steps * learned * ranks,
+        columns=(*columns, *(name for part in parts for name in part.columns)),
         resumed=resumed,
-        # Without any statistics the first rollout is for the observation normaliser only.
-        first_learning=0 if config.init or config.task == PRIOR else 1,
+        warmup=warmup,
+        first_learning=first_learning,
+        unseen=unseen,
     )
-    if config.styled:
-        parts.append(Style(config, env, agent))
-    if config.clone > 0:
-        parts.append(Lesson(config, env, agent))
-    if first:
-        _begin_from(first, made)
-    if config.algo == "selfplay":
-        opponents = Opponents(config, env, agent)
-        parts.append(opponents)
-        rows = opponents.play.learned_rows
-    made.samples_each = made.rollout.steps * rows * ranks
-    made.columns += tuple(name for part in parts for name in part.columns)
-    return made
 
 
 def default_env(config: TrainConfig, seed: int) -> Env:
@@ -169,6 +203,7 @@ def _starts_of_clips(config: TrainConfig) -> Starts | None:
 
 
 def _learner(config: TrainConfig, env: Any, device: torch.device) -> Any:
+    """A PPO in all runs that have parts or a first policy; a Learner at least."""
     bf16 = {"auto": None, "float32": False, "bfloat16": True}[config.precision]
     if config.task == PRIOR:
         return latent_run.make_distiller(config, env, device, bf16)
@@ -186,15 +221,16 @@ def _shaped_like(config: TrainConfig, source: str) -> TrainConfig:
     return replace(config, ppo=replace(config.ppo, **shape))
 
 
-def _begin_from(source: str, made: Assembly) -> None:
-    """Takes the networks and statistics of another policy."""
-    policy, unseen = load_start(source, made.env, made.config.task)
+def _begin_from(
+    source: str, config: TrainConfig, env: Any, agent: PPO
+) -> tuple[int, Tensor | None]:
+    """Takes the networks and statistics of another policy. Returns for how many iterations only the
+    critic learns, and (D,) bool the features that the policy has never seen, None without any."""
+    policy, unseen = load_start(source, env, config.task)
     if policy.layer is not None:
         raise ValueError("--init is a latent policy: give --prior as well")
     assert policy.actor is not None
-    count = policy.metadata["obs_count"]
-    made.agent.load_policy(policy.actor, policy.mean, policy.std, count)
-    critic = made.agent.load_critic(policy.extra)
-    made.warmup = 0 if critic else made.config.hyper.critic_warmup
-    if bool(unseen.any()):
-        made.unseen, made.first_learning = unseen.to(made.device), 1
+    agent.load_policy(policy.actor, policy.mean, policy.std, policy.metadata["obs_count"])
+    critic = agent.load_critic(policy.extra)
+    warmup = 0 if critic else config.hyper.critic_warmup
+    return warmup, unseen.to(agent.device) if bool(unseen.any()) else None
