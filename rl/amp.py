@@ -21,9 +21,10 @@ from torch import Tensor, nn
 
 from rl.discriminator import Replay, discriminator_losses, style_reward
 from rl.graph import GraphedStep
+from rl.learned import learned_state, load_learned
 from rl.networks import MLP
 from rl.normalizer import Normalizer
-from rl.ranks import SharedGradients, SharedStep
+from rl.ranks import SharedGradients, SharedStep, own_rank
 from rl.rollout import Rollout
 from rl.style_features import Athletes, Demonstrations, load_demonstrations
 
@@ -142,8 +143,7 @@ class AMP:
         """
         self.source, self.config, self.device = source, config, torch.device(device)
         self.rows, self.steps, self.bf16 = rows, steps, bf16
-        self.world_size = dist.get_world_size() if dist.is_initialized() else 1
-        rank = dist.get_rank() if dist.is_initialized() else 0
+        rank, self.world_size = own_rank()
         self.generator = torch.Generator(self.device).manual_seed(seed + 2 + 1_000_003 * rank)
         dtype = torch.bfloat16 if bf16 else torch.float32
         shown = source.features(demonstrations.states.to(self.device))
@@ -319,9 +319,7 @@ class AMP:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that decides the next rewards and updates, by name."""
-        state = {f"net.{name}": p.detach() for name, p in self.net.named_parameters()}
-        for name, p in self.net.named_parameters():
-            state |= {f"adam.{name}.{key}": x for key, x in self.optimizer.state[p].items()}
+        state = learned_state(dict(self.net.named_parameters()), self.optimizer, "net.")
         state |= {f"norm.{key}": x for key, x in self.norm.state_dict().items()}
         state |= {f"replay.{key}": x for key, x in self.replay.state_dict().items()}
         tail = self.frames[self.steps :]
@@ -333,17 +331,8 @@ class AMP:
         def part(prefix: str) -> dict[str, Tensor]:
             return {k[len(prefix) :]: v for k, v in state.items() if k.startswith(prefix)}
 
-        with torch.no_grad():
-            for name, p in self.net.named_parameters():
-                saved = state.get(f"net.{name}")
-                if saved is None or saved.shape != p.shape:
-                    raise ValueError(f"the checkpoint's '{name}' does not fit this discriminator")
-                p.copy_(saved)
-                moments = part(f"adam.{name}.")
-                if moments:
-                    self.optimizer.state[p] = {
-                        key: x.clone().to(self.device) for key, x in moments.items()
-                    }
+        own = dict(self.net.named_parameters())
+        load_learned(own, self.optimizer, state, "net.", "discriminator")
         self.norm.load_state_dict(part("norm."))
         self.replay.load_state_dict(part("replay."))
         self.frames[self.steps :] = state["tail"].to(self.frames)

@@ -1,12 +1,9 @@
-"""What a run of training is told: its settings, the worlds they make, their command line, and what
-a resume keeps."""
+"""What a run of training is told: its settings, what they rule out, and their command line."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,13 +11,10 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from rl.amp import AMPConfig
-from rl.checkpoint import checkpoints, read_state
-from rl.host import local_ranks
 from rl.latent_action import LatentConfig
 from rl.ppo import PAPER, PPOConfig
 from rl.selfplay import SelfPlayConfig
-from sports.env import Env, Starts, make_env
-from sports.physics.variation import Variation
+from sports.env import Starts
 from sports.registry import get_task, task_names
 
 DEFAULT_WORLDS = {"mujoco": 256, "warp": 8192, "drake": 4}
@@ -129,42 +123,8 @@ class TrainConfig:
     ``trace.json.gz`` in the run's folder for chrome://tracing or ui.perfetto.dev."""
 
     def __post_init__(self) -> None:
-        for name in ("worlds", "samples", "minutes", "checkpoint_iterations"):
-            value = getattr(self, name)
-            if value is not None and value <= 0:
-                raise ValueError(f"{name} must be positive, not {value}")
-        if self.impact < 0.0 or self.impact_limit < 0.0:
-            raise ValueError("impact and impact_limit must not be negative")
-        if not all(0.0 <= p <= 1.0 for p in self.start_probability):
-            raise ValueError(f"start_probability must lie in [0, 1], not {self.start_probability}")
-        if self.clone < 0:
-            raise ValueError(f"clone must not be negative: {self.clone}")
-        if self.clone_fingers and not self.clone:
-            raise ValueError("--clone-fingers is for a run that clones: give --clone as well")
-        if self.clone and len(self.clips) != 1:
-            raise ValueError("cloning needs one clip of a whole episode: give it with --clips")
-        if self.clone and (self.prior is not None or self.task == PRIOR):
-            raise ValueError("the targets of a clip are no latents: leave --clone or --prior out")
-        if not self.styled and self.amp != AMPConfig():
-            raise ValueError("the --amp options need --algo amp")
-        if self.algo != "selfplay" and self.selfplay != SelfPlayConfig():
-            raise ValueError("the --selfplay options need --algo selfplay")
-        if self.algo == "selfplay" and self.clone:
-            raise ValueError("cloning shows one athlete's episode: leave --algo selfplay out")
-        if self.algo == "selfplay" and self.prior is not None:
-            raise ValueError("selfplay does not play through a latent prior yet: leave --prior out")
-        if self.styled and self.task == TRACKING:
-            raise ValueError("the tracker follows its clips frame by frame: leave --algo amp out")
-        if self.prior is None and (self.algo.startswith("latent") or self.latent != LatentConfig()):
-            raise ValueError("--algo latent and the --latent options need --prior")
-        if self.prior is not None and self.task in (TRACKING, PRIOR):
-            raise ValueError(f"the task '{self.task}' comes before a latent prior: leave it out")
-        if self.task not in ("", PRIOR) and self.tracker is not None:
-            raise ValueError("--tracker is for the task 'prior' alone")
-        if self.task == PRIOR and (self.algo != "ppo" or self.ppo != PPOConfig() or self.paper):
-            raise ValueError("the task 'prior' has a learner of its own: its options are --task.*")
-        if self.paper and self.ppo != PPOConfig():
-            raise ValueError("--paper fixes the hyper-parameters: leave the --ppo options out")
+        for mistake in _mistakes(self):
+            raise ValueError(mistake)
 
     @property
     def hyper(self) -> PPOConfig:
@@ -189,48 +149,48 @@ class TrainConfig:
         return self.worlds or DEFAULT_WORLDS[self.engine]
 
 
-MakeEnv = Callable[[TrainConfig, int], Any]
-"""(config, seed) -> environment."""
+def _mistakes(c: TrainConfig) -> Iterator[str]:
+    """What cannot be, setting by setting and then where two contradict each other."""
+    for name in ("worlds", "samples", "minutes", "checkpoint_iterations"):
+        value = getattr(c, name)
+        if value is not None and value <= 0:
+            yield f"{name} must be positive, not {value}"
+    if c.impact < 0.0 or c.impact_limit < 0.0:
+        yield "impact and impact_limit must not be negative"
+    if not all(0.0 <= p <= 1.0 for p in c.start_probability):
+        yield f"start_probability must lie in [0, 1], not {c.start_probability}"
+    if c.clone < 0:
+        yield f"clone must not be negative: {c.clone}"
 
+    if c.clone_fingers and not c.clone:
+        yield "--clone-fingers is for a run that clones: give --clone as well"
+    if c.clone and len(c.clips) != 1:
+        yield "cloning needs one clip of a whole episode: give it with --clips"
+    if c.clone and (c.prior is not None or c.task == PRIOR):
+        yield "the targets of a clip are no latents: leave --clone or --prior out"
 
-def default_env(config: TrainConfig, seed: int) -> Env:
-    """The config's task on its engine, in training mode."""
-    physics_options = dict(config.physics_options)
-    if config.engine == "mujoco" and local_ranks() > 1:
-        each = max(1, (os.cpu_count() or 1) // local_ranks())
-        physics_options = {"threads": each} | physics_options
-    if config.vary:
-        physics_options |= {"variation": Variation(), "variation_seed": seed}
-    if config.task == PRIOR:
-        from rl.distillation import make_distillation_env
+    if not c.styled and c.amp != AMPConfig():
+        yield "the --amp options need --algo amp"
+    if c.algo != "selfplay" and c.selfplay != SelfPlayConfig():
+        yield "the --selfplay options need --algo selfplay"
+    if c.algo == "selfplay" and c.clone:
+        yield "cloning shows one athlete's episode: leave --algo selfplay out"
+    if c.algo == "selfplay" and c.prior is not None:
+        yield "selfplay does not play through a latent prior yet: leave --prior out"
+    if c.styled and c.task == TRACKING:
+        yield "the tracker follows its clips frame by frame: leave --algo amp out"
 
-        return make_distillation_env(config, seed, physics_options)
-    if config.task == TRACKING:
-        from rl.tracker import TrackingConfig, make_tracking_env
+    if c.prior is None and (c.algo.startswith("latent") or c.latent != LatentConfig()):
+        yield "--algo latent and the --latent options need --prior"
+    if c.prior is not None and c.task in (TRACKING, PRIOR):
+        yield f"the task '{c.task}' comes before a latent prior: leave it out"
+    if c.task not in ("", PRIOR) and c.tracker is not None:
+        yield "--tracker is for the task 'prior' alone"
+    if c.task == PRIOR and (c.algo != "ppo" or c.ppo != PPOConfig() or c.paper):
+        yield "the task 'prior' has a learner of its own: its options are --task.*"
 
-        return make_tracking_env(
-            config.clips,
-            engine=config.engine,
-            num_worlds=config.num_worlds,
-            seed=seed,
-            strength=config.strength,
-            limits=config.limits,
-            config=TrackingConfig(**config.options),
-            physics_options=physics_options,
-            timestep_divisor=config.timestep_divisor,
-        )
-    return make_env(
-        config.task,
-        engine=config.engine,
-        num_worlds=config.num_worlds,
-        seed=seed,
-        strength=config.strength,
-        limits=config.limits,
-        training=True,
-        options=config.options,
-        physics_options=physics_options,
-        timestep_divisor=config.timestep_divisor,
-    )
+    if c.paper and c.ppo != PPOConfig():
+        yield "--paper fixes the hyper-parameters: leave the --ppo options out"
 
 
 def task_options(task: str) -> type:
@@ -264,62 +224,6 @@ def load_placed_starts(paths: tuple[Path, ...], probability: float) -> Starts | 
 
     placed = tuple(p for p in paths if "problem" in Clip.load(p).meta)
     return load_starts(placed, probability) if placed else None
-
-
-FREE = {"out", "resume", "samples", "minutes", "quiet", "checkpoint_minutes"}
-FREE |= {"checkpoint_iterations", "device", "cuda_graph", "physics_options", "profile"}
-"""What a resumed run may change; everything else is the run's own."""
-
-
-def settle(config: TrainConfig) -> TrainConfig:
-    """The run's own settings on a resume. Raises ValueError where the caller's contradict them."""
-    if not config.task:
-        raise ValueError("train needs the name of a task")
-    saved = checkpoints(config.out)
-    if saved and not config.resume:
-        raise ValueError(
-            f"{config.out} already holds a run: add --resume to continue it, or give another --out"
-        )
-    if not saved:
-        return config
-    stored = config_from_dict(read_state(saved[-1])["card"]["config"])
-    plain = TrainConfig(task=config.task)
-    changes = {}
-    for f in dataclasses.fields(TrainConfig):
-        given, own = getattr(config, f.name), getattr(stored, f.name)
-        if f.name == "options":
-            _same_options(config.task, given, own)
-        elif f.name in FREE:
-            if given == getattr(plain, f.name) and f.name in ("samples", "minutes"):
-                changes[f.name] = own
-            else:
-                changes[f.name] = given
-        elif given != own and given != getattr(plain, f.name):
-            raise ValueError(
-                f"{f.name} {given!r} differs from the run's {own!r}: a resumed run keeps its "
-                "settings; leave it out, or start a new run in another --out"
-            )
-    if stored.task != config.task:
-        raise ValueError(f"{config.out} is a run of task '{stored.task}', not of '{config.task}'")
-    return replace(stored, **changes)
-
-
-def _same_options(task: str, given: dict[str, Any], own: dict[str, Any]) -> None:
-    """Raises ValueError where a task option that was asked for is not the run's.
-
-    The command line gives every option of the task, asked for or not, so that one at its default
-    asks for nothing; lists are what JSON made of the run's tuples.
-    """
-    known = (*task_names(), TRACKING, PRIOR)
-    plain = dataclasses.asdict(task_options(task)()) if task in known else {}
-    for name, value in given.items():
-        asked = json.loads(json.dumps(value))
-        default = json.loads(json.dumps(plain.get(name)))
-        if asked not in (default, own.get(name, default)):
-            raise ValueError(
-                f"{name} {value!r} differs from the run's {own.get(name, default)!r}: a resumed "
-                "run keeps its settings; leave it out, or start a new run in another --out"
-            )
 
 
 def config_from_dict(data: dict[str, Any]) -> TrainConfig:

@@ -19,9 +19,10 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from rl.graph import GraphedStep
+from rl.learned import learned_state, load_learned
 from rl.policy import Policy
 from rl.prior import FORMAT, LatentNets, Shape, body_digest, check_layout, self_layout
-from rl.ranks import SharedGradients, SharedStep
+from rl.ranks import SharedGradients, SharedStep, own_rank
 from rl.rollout import Rollout
 from rl.tracker import TrackingEnv
 from rl.tracking_terms import nearest_turn
@@ -193,8 +194,7 @@ class Distiller:
             },
         }
         """What a prior says about itself, beside what every run says."""
-        self.world_size = dist.get_world_size() if dist.is_initialized() else 1
-        rank = dist.get_rank() if dist.is_initialized() else 0
+        rank, self.world_size = own_rank()
         self.generator = torch.Generator(self.device).manual_seed(seed + 1 + 1_000_003 * rank)
 
         def scalar(value: float) -> Tensor:
@@ -363,9 +363,7 @@ class Distiller:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that decides the next update, by name, and the normaliser."""
-        state = {f"nets.{name}": p.detach() for name, p in self.nets.named_parameters()}
-        for name, p in self.nets.named_parameters():
-            state |= {f"adam.{name}.{key}": x for key, x in self.optimizer.state[p].items()}
+        state = learned_state(dict(self.nets.named_parameters()), self.optimizer, "nets.")
         norm = {f"normalizer.{k}": getattr(self.obs_norm, k) for k in ("mean", "std")}
         own = {"teacher": self._digest(), "generator": self.generator.get_state()}
         return state | norm | own
@@ -374,18 +372,7 @@ class Distiller:
         """Takes a state back. Raises ValueError where it or the teacher does not fit."""
         if "teacher" not in state or not torch.equal(state["teacher"], self._digest()):
             raise ValueError("the run learned from another tracker: resume it with that one")
-        with torch.no_grad():
-            for name, p in self.nets.named_parameters():
-                saved = state.get(f"nets.{name}")
-                if saved is None or saved.shape != p.shape:
-                    raise ValueError(f"the checkpoint's '{name}' does not fit this network")
-                p.copy_(saved)
-                start = f"adam.{name}."
-                moments = {k: x for k, x in state.items() if k.startswith(start)}
-                if moments:
-                    self.optimizer.state[p] = {
-                        k.removeprefix(start): x.clone().to(self.device) for k, x in moments.items()
-                    }
+        load_learned(dict(self.nets.named_parameters()), self.optimizer, state, "nets.")
         self.generator.set_state(state["generator"].cpu())
 
 

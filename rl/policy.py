@@ -23,6 +23,7 @@ from rl import pretrained
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.latent_action import LatentActions, LatentConfig
 from rl.networks import MLP
+from rl.policy_stack import unstacked
 from rl.prior import LatentPrior, PriorError, find_prior
 from warmstart.atomic import write_bytes, write_text
 
@@ -229,17 +230,14 @@ def _from_pool(run: Path, which: str) -> Policy:
         have = f"it has {', '.join('@' + name for name in names)}" if names else "it has none"
         raise PolicyError(f"the run '{run}' has no opponent '@{which}': {have}")
     slot = league["slots"].index(names.index(which))
-    assert learner.actor is not None
-    weights = {}
-    for name in learner.actor.state_dict():
-        x = tensors[f"selfplay/stack.{name}"][slot].float()
-        weights[name] = x.T.contiguous() if name.endswith(".weight") else x[0].contiguous()
+    stack = {k.removeprefix("selfplay/stack."): x for k, x in tensors.items() if "/stack." in k}
+    weights, mean, std = unstacked(stack, slot)
     card = {
         **learner.metadata,
         "samples": int(league["entries"][names.index(which)]["samples"]),
         "metrics": {},
-        "obs_mean": tensors["selfplay/stack.mean"][slot, 0].tolist(),
-        "obs_std": tensors["selfplay/stack.std"][slot, 0].tolist(),
+        "obs_mean": mean.tolist(),
+        "obs_std": std.tolist(),
         "sha256": hashlib.sha256(save(weights)).hexdigest(),
     }
     return _build(card, weights, f"{run}@{which}")

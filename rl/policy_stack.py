@@ -56,9 +56,7 @@ class PolicyStack:
 
     def read(self, slot: int) -> tuple[dict[str, Tensor], Tensor, Tensor]:
         """The actor's ``state_dict`` and statistics (D,) of a slot, float32."""
-        actor = {f"{n}.weight": w[slot].float().T.contiguous() for n, w in self.weights.items()}
-        actor |= {f"{n}.bias": b[slot, 0].float() for n, b in self.biases.items()}
-        return actor, self.mean[slot, 0].clone(), self.std[slot, 0].clone()
+        return unstacked(self.state_dict(), slot)
 
     @torch.no_grad()
     def __call__(self, obs: Tensor) -> Tensor:
@@ -82,3 +80,11 @@ class PolicyStack:
             if name not in state or state[name].shape != own.shape:
                 raise ValueError(f"the checkpoint's pool does not fit this run's ('{name}')")
             own.copy_(state[name])
+
+
+def unstacked(state: Mapping[str, Tensor], slot: int) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """One actor's own ``state_dict`` and statistics (D,), float32, from the ``state_dict`` of a
+    stack."""
+    actor = {n: x[slot].float().T.contiguous() for n, x in state.items() if n.endswith(".weight")}
+    actor |= {n: x[slot, 0].float() for n, x in state.items() if n.endswith(".bias")}
+    return actor, state["mean"][slot, 0].clone(), state["std"][slot, 0].clone()

@@ -1,10 +1,10 @@
-"""Proximal policy optimisation (Schulman et al. 2017), one file, read top to bottom.
+"""Proximal policy optimisation (Schulman et al. 2017), read top to bottom.
 
 A Gaussian policy of fixed or scheduled sigma, a critic on normalised returns, clipped surrogate,
 a penalty on means outside the action bounds, and a learning rate that follows the KL divergence.
 Matrix products run in bf16 on a GPU; log-probabilities, advantages, statistics and the optimiser
 stay in float32 or better. Between two ``update`` calls nothing waits for the device, and the
-minibatch step is replayed as one CUDA graph.
+minibatch step is replayed as one CUDA graph. The formulas are in ``rl.ppo_losses``.
 """
 
 from __future__ import annotations
@@ -17,9 +17,17 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from rl.graph import GraphedStep
+from rl.learned import learned_state, load_learned
 from rl.networks import MLP, Activation
 from rl.normalizer import Normalizer
-from rl.ranks import SharedGradients, SharedStep
+from rl.ppo_losses import (
+    bounds_excess,
+    clipped_value_error,
+    gaussian_divergence,
+    gaussian_log_prob,
+    surrogate_loss,
+)
+from rl.ranks import SharedGradients, SharedStep, own_rank
 from rl.rollout import Rollout, generalized_advantages
 
 
@@ -109,19 +117,6 @@ PAPER = replace(
 """Hyper-parameters of the SMPLOlympics paper (arXiv 2407.00187); run it with 2048 worlds."""
 
 
-def gaussian_log_prob(action: Tensor, mean: Tensor, sigma: Tensor) -> Tensor:
-    """(...) log density of action (..., U) under N(mean, sigma^2), float32."""
-    z = (action - mean) / sigma
-    constant = action.shape[-1] * (sigma.log() + 0.5 * math.log(2.0 * math.pi))
-    return -0.5 * z.square().sum(-1) - constant
-
-
-def surrogate_loss(ratio: Tensor, advantage: Tensor, clip_ratio: float) -> Tensor:
-    """(...) -min(ratio A, clip(ratio) A). Source: Schulman et al. 2017, eq. 7."""
-    clipped = ratio.clamp(1.0 - clip_ratio, 1.0 + clip_ratio)
-    return -torch.minimum(ratio * advantage, clipped * advantage)
-
-
 def adapted_rate(rate: Tensor, kl: Tensor, config: PPOConfig) -> Tensor:
     """() learning rate after a minibatch of divergence ``kl``, on the device."""
     if config.kl_band is None:
@@ -162,8 +157,7 @@ class PPO:
         self.critic.to(self.device)
         self.obs_norm = Normalizer(obs_size, self.device, clip=config.observation_clip)
         self.value_norm = Normalizer(1, self.device, clip=math.inf)
-        self.world_size = dist.get_world_size() if dist.is_initialized() else 1
-        rank = dist.get_rank() if dist.is_initialized() else 0
+        rank, self.world_size = own_rank()
         self.generator = torch.Generator(self.device).manual_seed(seed + 1 + 1_000_003 * rank)
 
         def scalar(value: float) -> Tensor:
@@ -205,9 +199,14 @@ class PPO:
                 f"{c.steps} steps of {rows} worlds x agents cannot be cut into {c.minibatches} "
                 "minibatches: use more worlds or fewer minibatches"
             )
-        outputs = self.actor.head.out_features
-        inputs = self.obs_norm.mean.numel()
-        return Rollout(c.steps, rows, inputs, outputs, self.device, self.obs_dtype)
+        sizes = (self.obs_norm.mean.numel(), self.actor.head.out_features)
+        return Rollout(c.steps, rows, *sizes, self.device, self.obs_dtype)
+
+    def schedule(self, share: float) -> None:
+        """Sets sigma for the part of the run that is done, 0..1."""
+        c = self.config
+        if c.sigma_final is not None:
+            self.sigma.fill_(c.sigma * (c.sigma_final / c.sigma) ** share)
 
     # -- acting ---------------------------------------------------------------------------------
 
@@ -215,10 +214,7 @@ class PPO:
         """How the networks multiply: in bf16 where that was asked for."""
         # Without the cache: casts made inside a captured graph must not outlive it.
         return torch.autocast(
-            self.device.type,
-            dtype=torch.bfloat16,
-            enabled=self.bf16,
-            cache_enabled=False,
+            self.device.type, dtype=torch.bfloat16, enabled=self.bf16, cache_enabled=False
         )
 
     def prepare(self, obs: Tensor) -> Tensor:
@@ -335,17 +331,13 @@ class PPO:
             value = self.critic(b["obs"]).squeeze(-1)
         ratio = (gaussian_log_prob(b["action"], mean, self.sigma) - b["log_prob"]).exp()
         policy_loss = (weight * surrogate_loss(ratio, b["advantage"], c.clip_ratio)).mean()
-        bounds_loss = (weight * (mean.abs() - 1.0).clamp(min=0.0).square().sum(-1)).mean()
-        error = (value - b["target"]).square()
-        if c.value_clip is not None:
-            moved = b["value"] + (value - b["value"]).clamp(-c.value_clip, c.value_clip)
-            error = torch.maximum(error, (moved - b["target"]).square())
+        bounds_loss = (weight * bounds_excess(mean)).mean()
+        error = clipped_value_error(value, b["target"], b["value"], c.value_clip)
         value_loss = (weight * error).mean()
         actor_loss = policy_loss + c.bounds_coefficient * bounds_loss
         (self.actor_weight * actor_loss + c.critic_coefficient * value_loss).backward()
         with torch.no_grad():
-            divergence = (mean - b["mean"]).square().sum(-1) / (2.0 * self.sigma.square())
-            kl = (weight * divergence).mean()
+            kl = (weight * gaussian_divergence(mean, b["mean"], self.sigma)).mean()
             clipped = (weight * ((ratio - 1.0).abs() > c.clip_ratio)).mean()
             return torch.stack((kl, clipped, policy_loss, value_loss, bounds_loss))
 
@@ -372,10 +364,7 @@ class PPO:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that decides the next update, by name: weights, moments, rates, noise."""
-        state = {name: p.detach() for name, p in self._named_parameters().items()}
-        for name, p in self._named_parameters().items():
-            for key, x in self.optimizer.state[p].items():
-                state[f"adam.{name}.{key}"] = x
+        state = learned_state(self._named_parameters(), self.optimizer)
         for part, norm in (("obs_norm", self.obs_norm), ("value_norm", self.value_norm)):
             state |= {f"{part}.{key}": x for key, x in norm.state_dict().items()}
         state |= {"sigma": self.sigma, "learning_rate": self.learning_rate}
@@ -383,24 +372,13 @@ class PPO:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Takes a state back. Raises ValueError where it does not fit."""
-        with torch.no_grad():
-            for name, p in self._named_parameters().items():
-                if name not in state or state[name].shape != p.shape:
-                    raise ValueError(f"the checkpoint's '{name}' does not fit this network")
-                p.copy_(state[name])
-                prefix = f"adam.{name}."
-                moments = {k: x for k, x in state.items() if k.startswith(prefix)}
-                if moments:
-                    self.optimizer.state[p] = {
-                        key.removeprefix(prefix): x.clone().to(self.device)
-                        for key, x in moments.items()
-                    }
-            for part, norm in (("obs_norm", self.obs_norm), ("value_norm", self.value_norm)):
-                keys = ("total", "pending")
-                norm.load_state_dict({key: state[f"{part}.{key}"] for key in keys})
-            self.sigma.copy_(state["sigma"])
-            self.learning_rate.copy_(state["learning_rate"])
-            self.generator.set_state(state["generator"].cpu())
+        load_learned(self._named_parameters(), self.optimizer, state)
+        for part, norm in (("obs_norm", self.obs_norm), ("value_norm", self.value_norm)):
+            keys = ("total", "pending")
+            norm.load_state_dict({key: state[f"{part}.{key}"] for key in keys})
+        self.sigma.copy_(state["sigma"])
+        self.learning_rate.copy_(state["learning_rate"])
+        self.generator.set_state(state["generator"].cpu())
 
     def load_policy(self, actor: nn.Module, mean: Tensor, std: Tensor, count: float) -> None:
         """Starts from another policy's actor and observation statistics. Raises ValueError."""

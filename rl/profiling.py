@@ -24,6 +24,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from rl import provenance
+from rl.parts import Style
 from warmstart.atomic import write_text
 
 WARM_UP, TIMED, TRACED = 3, 5, 2
@@ -176,7 +177,7 @@ def profile_training(trainer: Any, iterate: Callable[[], Any]) -> Path:
             "engine": trainer.config.engine,
             "worlds": trainer.env.num_worlds,
             "ranks": trainer.ranks,
-            "samples_per_s": trainer.samples_each / whole,
+            "samples_per_s": trainer.made.samples_each / whole,
             "seconds_per_update": seconds,
             "waits_in_rollouts": dict(places),
             "updates_timed": TIMED,
@@ -216,7 +217,8 @@ def lines(figures: dict[str, Any], cuda: bool) -> list[str]:
 
 
 def _name_parts(phases: Phases, trainer: Any) -> None:
-    env, agent, style = trainer.env, trainer.agent, trainer.style
+    env, agent = trainer.env, trainer.agent
+    style = next((part.amp for part in trainer.parts if isinstance(part, Style)), None)
     physics = getattr(env, "physics", None)
     phases.wrap(physics, "step", SIMULATION)
     phases.wrap(env, "step", SENSES if physics is not None else SIMULATION)

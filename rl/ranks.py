@@ -19,6 +19,13 @@ _ALIGNED = 64
 """Each gradient begins at a multiple of so many numbers, as kernels like it."""
 
 
+def own_rank() -> tuple[int, int]:
+    """This process's rank and how many there are; (0, 1) for one alone."""
+    if not dist.is_initialized():
+        return 0, 1
+    return dist.get_rank(), dist.get_world_size()
+
+
 class SharedGradients:
     """Gradients of parameters and a few numbers beside them, in one buffer for one message.
 

@@ -27,6 +27,7 @@ from torch import Tensor
 from rl.league import League
 from rl.policy_stack import PolicyStack
 from rl.ppo import PPO
+from rl.ranks import own_rank
 from rl.rollout import Rollout
 
 
@@ -130,7 +131,7 @@ class SelfPlay:
                 f"one more, and pool {config.pool} and {some} worlds give {slots}: use more worlds "
                 "or a shorter --selfplay.ladder"
             )
-        rank = dist.get_rank() if dist.is_initialized() else 0
+        rank, _ = own_rank()
         deal = torch.Generator().manual_seed(seed + 3 + 1_000_003 * rank)
         order = torch.randperm(worlds, generator=deal)
         self.frozen = some - some % slots

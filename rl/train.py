@@ -6,14 +6,12 @@ The same loop drives every engine; with several ranks each plays its own worlds.
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
 import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,44 +19,17 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from rl import amp, latent_run, provenance
-from rl.checkpoint import (
-    CheckpointError,
-    checkpoints,
-    load_checkpoint,
-    ranks_of,
-    save_checkpoint,
-)
-from rl.cloning import STATISTIC as CLONE_ERROR
-from rl.cloning import Cloning
-from rl.config import (
-    DEFAULT_SAMPLES,
-    PRIOR,
-    TRACKING,
-    MakeEnv,
-    TrainConfig,
-    default_env,
-    load_placed_starts,
-    load_starts,
-    parse_args,
-    settle,
-)
-from rl.host import Signals, Stopwatch, join_ranks, one_torch_thread, pick_device
-from rl.imitation import Imitation
-from rl.impact import ImpactCost
-from rl.meter import EpisodeMeter
-from rl.policy import FORMAT as POLICY_FORMAT
-from rl.policy import read_policy
-from rl.ppo import PPO, STATISTICS
+from rl import latent_run
+from rl.assembly import Assembly, MakeEnv, assemble, default_env
+from rl.checkpoint import CheckpointError
+from rl.config import DEFAULT_SAMPLES, PRIOR, TrainConfig, load_starts, parse_args
+from rl.host import Signals, Stopwatch, join_ranks, one_torch_thread
 from rl.profiling import profile_training
 from rl.ranks import over_ranks
 from rl.rollout import collect
+from rl.run_folder import Progress, restore, save, settle, write_config
 from rl.runlog import Row, RunLog
-from rl.selfplay import SelfPlay
-from rl.warm_start import load_start
 from sports.env import Starts
-from warmstart.atomic import write_text
-from warmstart.clip import Clip
 
 __all__ = ["RunSummary", "TrainConfig", "load_starts", "main", "parse_args", "train"]
 
@@ -112,8 +83,8 @@ def train(
     """
     began_group = join_ranks(config.device)
     try:
-        config = settle(config)
-        trainer = _Trainer(config, starts, environment, on_iteration)
+        made = assemble(settle(config), starts, environment)
+        trainer = _Trainer(made, on_iteration)
         summary = trainer.profile() if config.profile else trainer.run(part)
     except ValueError:  # every rank has made the same mistake
         _leave_ranks(began_group)
@@ -131,147 +102,46 @@ def _leave_ranks(began: bool) -> None:
 class _Trainer:
     """One run in one process."""
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        starts: Starts | None,
-        environment: MakeEnv,
-        on_iteration: Callable[[Row], None] | None,
-    ) -> None:
-        self.on_iteration = on_iteration
-        ranked = dist.is_initialized()
-        self.rank = dist.get_rank() if ranked else 0
-        self.ranks = dist.get_world_size() if ranked else 1
-        self.device = pick_device(config.device)
-        self.resumed = config.resume and bool(checkpoints(config.out))
-        fresh = config.init and not self.resumed
-        card = read_policy(str(config.init), config.task).metadata if fresh else {}
-        if "hidden" in card and not config.paper:
-            shape = {n: card[n] for n in ("hidden", "activation", "observation_clip")}
-            shape["hidden"] = tuple(shape["hidden"])
-            config = replace(config, ppo=replace(config.ppo, **shape))
-        self.config, self.hyper = config, config.hyper
-        self.env = environment(config, config.seed + 7919 * self.rank)
-        if starts is None and config.clips and config.task not in (TRACKING, PRIOR):
-            load = load_placed_starts if config.styled else load_starts
-            starts = load(config.clips, config.start_probability[0])
-        if starts is not None:
-            self.env.starts = starts.to(self.env.device)
-        self.imitation: Imitation | None = None
-        if config.imitation > 0.0:
-            if starts is None:
-                raise ValueError("the imitation reward needs demonstrations: give --clips")
-            self.imitation = Imitation(self.env, config.imitation, config.imitation_sharpness)
-        self.bonuses: list[Callable[[Any], Tensor]] = [self.imitation] if self.imitation else []
-        if config.impact > 0.0:
-            self.bonuses.append(ImpactCost(self.env, config.impact, config.impact_limit))
-        if config.prior is not None:
-            latent_run.act_through_prior(self.env, config)
-        rows = self.env.num_worlds * self.env.num_agents
-        self.agent = self._learner()
-        self.rollout = self.agent.new_rollout(rows)
-        self.meter = EpisodeMeter(self.env)
-        self.style: amp.AMP | None = None
-        if config.styled:
-            device, how = self.device, (config.seed, config.cuda_graph, self.agent.bf16)
-            self.style = amp.of_athletes(
-                self.env, config.clips, self.hyper.steps, config.amp, device, *how
-            )
-        self.cloning: Cloning | None = None
-        if config.clone > 0:
-            clip, fingers = Clip.load(config.clips[0]), config.clone_fingers
-            self.cloning = Cloning(self.env, self.agent, clip, config.clone, fingers)
-        self.iteration, self.samples, self.minutes = 0, 0, 0.0
-        self.metrics: dict[str, float] = {}
-        self.warmup = 0
-        # Without any statistics the first rollout is for the observation normaliser only.
-        self.first_learning = 0 if config.init or config.task == PRIOR else 1
-        self.unseen: Tensor | None = None
-        """(D,) bool features that the first policy, of another task, has never seen."""
-        if fresh:
-            self._begin_from(str(config.init))
-        self.selfplay: SelfPlay | None = None
-        if config.algo == "selfplay":
-            self.selfplay = SelfPlay(
-                self.env, self.agent, config.selfplay, self.hyper.steps, config.seed
-            )
-        learned = self.selfplay.learned_rows if self.selfplay is not None else rows
-        self.samples_each = self.rollout.steps * learned * self.ranks
-        self.obs = self._restore() if self.resumed else self.env.reset()
-
-    def _learner(self) -> Any:
-        c = self.config
-        bf16 = {"auto": None, "float32": False, "bfloat16": True}[c.precision]
-        if c.task == PRIOR:
-            return latent_run.make_distiller(c, self.env, self.device, bf16)
-        sizes = (self.env.obs_size, self.env.action_size)
-        return PPO(*sizes, self.hyper, self.device, c.seed, c.cuda_graph, bf16)
-
-    def _begin_from(self, source: str) -> None:
-        """Takes the networks and statistics of another policy."""
-        policy, unseen = load_start(source, self.env, self.config.task)
-        if policy.layer is not None:
-            raise ValueError("--init is a latent policy: give --prior as well")
-        assert policy.actor is not None
-        count = policy.metadata["obs_count"]
-        self.agent.load_policy(policy.actor, policy.mean, policy.std, count)
-        critic = self.agent.load_critic(policy.extra)
-        self.warmup = 0 if critic else self.hyper.critic_warmup
-        if bool(unseen.any()):
-            self.unseen, self.first_learning = unseen.to(self.device), 1
-
-    def _watch(self, result: Any) -> None:
-        self.meter(result)
-        if self.style is not None:
-            self.style.watch(result)
-        if self.selfplay is not None:
-            self.selfplay.watch(result)
-
-    # -- the loop -------------------------------------------------------------------------------
+    def __init__(self, made: Assembly, on_iteration: Callable[[Row], None] | None) -> None:
+        self.made, self.on_iteration = made, on_iteration
+        self.config, self.device = made.config, made.device
+        self.rank, self.ranks = made.rank, made.ranks
+        self.env, self.agent, self.parts = made.env, made.agent, made.parts
+        if made.resumed:
+            self.now = restore(made)
+        else:
+            self.now = Progress(obs=self.env.reset(), warmup=made.warmup)
+        self.goal = self.config.samples
+        """Samples at which the run is done, as far as they decide."""
+        self.began = 0.0
+        """When the run began by this process's clock, had it never paused (s)."""
 
     def run(self, part: float) -> RunSummary:
         """Iterates until a stop criterion holds for this part of the run."""
         config = self.config
-        stop_samples = config.samples
-        if stop_samples is None and config.minutes is None:
-            stop_samples = DEFAULT_SAMPLES
+        if self.goal is None and config.minutes is None:
+            self.goal = DEFAULT_SAMPLES
         log = None
         if self.rank == 0:
-            self._write_config()
-            if self.resumed and not config.quiet:
-                print(f"{config.out} goes on after iteration {self.iteration}", flush=True)
-            if self.ranks > 1 and not config.quiet:
-                print(
-                    f"{self.ranks} processes with {self.env.num_worlds} worlds each: samples and "
-                    "samples_per_s are of all of them",
-                    flush=True,
-                )
-        began = time.monotonic() - 60.0 * self.minutes
-        last_saved, saved, stopped_by = self.minutes, None, ""
+            write_config(self.made)
+            self._greet()
+        self.began = time.monotonic() - 60.0 * self.now.minutes
+        saved_at, saved = self.now.minutes, None
         try:
             with Signals() as signals:
-                while not stopped_by:
-                    if stop_samples is not None and self.samples >= part * stop_samples:
-                        stopped_by = "samples"
-                    elif config.minutes is not None and self.minutes >= part * config.minutes:
-                        stopped_by = "minutes"
-                    elif signals.heard(self.device):
-                        stopped_by = "signal"
-                    else:
-                        done_before = self.iteration
-                        row = self._iterate(began, stop_samples)
-                        if self.rank == 0:
-                            if log is None:
-                                log = RunLog(config.out, list(row), done_before, config.quiet)
-                            log.write(row, self._share(stop_samples))
-                            if self.on_iteration is not None:
-                                self.on_iteration(row)
-                        every = config.checkpoint_iterations
-                        due = self.minutes - last_saved >= config.checkpoint_minutes
-                        saved = None
-                        if due or (every is not None and self.iteration % every == 0):
-                            saved, last_saved = self._save(), self.minutes
-                saved = saved or self._save()
+                while not (stopped_by := self._stopped_by(part, signals)):
+                    row = self._iterate()
+                    if self.rank == 0:
+                        if log is None:
+                            after = self.now.iteration - 1
+                            log = RunLog(config.out, list(row), after, config.quiet)
+                        log.write(row, self._share())
+                        if self.on_iteration is not None:
+                            self.on_iteration(row)
+                    saved = save(self.made, self.now) if self._save_due(saved_at) else None
+                    if saved is not None:
+                        saved_at = self.now.minutes
+                saved = saved or save(self.made, self.now)
                 if config.task == PRIOR and self.rank == 0:
                     latent_run.write_prior(config.out)
         except OSError as error:
@@ -287,261 +157,205 @@ class _Trainer:
 
     def profile(self) -> RunSummary:
         """Measures a few updates instead of training; the run's checkpoints stay as they are."""
-        began = time.monotonic() - 60.0 * self.minutes
+        self.began = time.monotonic() - 60.0 * self.now.minutes
         try:
-            path = profile_training(self, lambda: self._iterate(began, self.config.samples))
+            path = profile_training(self, self._iterate)
         finally:
             self.env.close()
         return self._summary("profile", path)
 
+    def _greet(self) -> None:
+        if self.config.quiet:
+            return
+        if self.made.resumed:
+            print(f"{self.config.out} goes on after iteration {self.now.iteration}", flush=True)
+        if self.ranks > 1:
+            print(
+                f"{self.ranks} processes with {self.env.num_worlds} worlds each: samples and "
+                "samples_per_s are of all of them",
+                flush=True,
+            )
+
+    def _stopped_by(self, part: float, signals: Signals) -> str:
+        """Which criterion ends this part of the run now, or nothing."""
+        minutes = self.config.minutes
+        if self.goal is not None and self.now.samples >= part * self.goal:
+            return "samples"
+        if minutes is not None and self.now.minutes >= part * minutes:
+            return "minutes"
+        return "signal" if signals.heard(self.device) else ""
+
+    def _save_due(self, saved_at: float) -> bool:
+        """``saved_at``: minutes at the last checkpoint of this session."""
+        every = self.config.checkpoint_iterations
+        if every is not None and self.now.iteration % every == 0:
+            return True
+        return self.now.minutes - saved_at >= self.config.checkpoint_minutes
+
     def _summary(self, stopped_by: str, path: Path) -> RunSummary:
         return RunSummary(
             out=self.config.out,
-            iterations=self.iteration,
-            samples=self.samples,
-            minutes=self.minutes,
+            iterations=self.now.iteration,
+            samples=self.now.samples,
+            minutes=self.now.minutes,
             stopped_by=stopped_by,
-            metrics=self.metrics,
+            metrics=self.now.metrics,
             checkpoint=path,
             rank=self.rank,
         )
 
-    def _iterate(self, began: float, stop_samples: int | None) -> Row:
+    # -- one iteration --------------------------------------------------------------------------
+
+    def _iterate(self) -> Row:
         """One rollout and its update. Waits for the device once, for the numbers of the row."""
-        self._schedule(self._share(stop_samples))
-        learns = self.iteration >= self.first_learning
+        now, began = self.now, self.now.minutes
+        learns = now.iteration >= self.made.first_learning
+        self._schedule(self._share())
         clock = Stopwatch(self.device)
         clock.mark()
         self._play()
         clock.mark()
-        losses = self._learn()
+        losses = self._learn() if learns else self._look()
         clock.mark()
-        row: Row = {"iteration": self.iteration + 1}
-        rates = {"learning_rate": self.agent.learning_rate, "sigma": self.agent.sigma}
-        levels = {f"curriculum/{k}": x.float().mean() for k, x in self.env.curriculum.items()}
-        means = losses | rates | levels
-        physics = getattr(self.env, "physics", None)
-        counts = {k: getattr(physics, k, 0) for k in ("nan_worlds", "overflow")}
-        episode = self.meter.totals()
-        # Rank 0's clock decides for all: the others add 0 seconds.
-        seconds = time.monotonic() - began if self.rank == 0 else 0.0
-        own = (*counts.values(), torch.tensor(seconds, dtype=torch.float64))
-        totals, averages = over_ranks(
-            torch.cat([episode.to(self.device), *(self._number(x) for x in own)]),
-            torch.cat([self._number(x) for x in means.values()]),
-        )  # the one wait of the iteration
-        before = self.minutes
-        # Seconds were read before the device had finished; the wait is over now.
-        self.minutes = (time.monotonic() - began) / 60.0
-        if self.ranks > 1:
-            self.minutes = totals[-1] / 60.0
-        self.iteration += 1
-        self.samples += self.samples_each
-        counts_now = {k: int(v) for k, v in zip(counts, totals[len(episode) :])}
-        means_now = dict(zip(means, averages))
-        losses_now = {k: means_now[k] for k in (*losses, *rates)}
-        if not all(math.isfinite(v) for v in losses_now.values()):
+        told = self._numbers(losses)
+        now.iteration += 1
+        now.samples += self.made.samples_each
+        if not all(math.isfinite(v) for v in told.losses.values()):
             raise RuntimeError(
-                f"learning diverged at iteration {self.iteration} (a loss is not finite): go on "
+                f"learning diverged at iteration {now.iteration} (a loss is not finite): go on "
                 "from the last checkpoint with --resume, or start with a smaller learning rate"
             )
-        contests: Row = {}
-        if self.selfplay is not None:
-            contests |= self.selfplay.settle(self.samples, learns)
-        summary = self.meter.summary(totals)
-        metrics = {k[8:]: v for k, v in summary.items() if k.startswith("metrics/")}
-        self.metrics |= {k: v for k, v in metrics.items() if v is not None and math.isfinite(v)}
-        took = max(60.0 * (self.minutes - before), 1e-9)
+        settled: Row = {}
+        for part in self.parts:
+            settled |= part.settle(now.samples, learns)
+        metrics = {k[8:]: v for k, v in told.episodes.items() if k.startswith("metrics/")}
+        now.metrics |= {k: v for k, v in metrics.items() if v is not None and math.isfinite(v)}
+        took = max(60.0 * (now.minutes - began), 1e-9)
         rollout_s, update_s = clock.laps()
-        row |= {
-            "samples": self.samples,
-            "minutes": self.minutes,
-            "samples_per_s": self.samples_each / took,
+        return {
+            "iteration": now.iteration,
+            "samples": now.samples,
+            "minutes": now.minutes,
+            "samples_per_s": self.made.samples_each / took,
             "rollout_s": rollout_s,
             "update_s": update_s,
-            **dict.fromkeys(STATISTICS if self.config.task != PRIOR else ()),
-            **dict.fromkeys(amp.STATISTICS if self.style is not None else ()),
-            **dict.fromkeys((CLONE_ERROR,) if self.cloning is not None else ()),
-            **losses_now,
-            **contests,
-            **summary,
+            **dict.fromkeys(self.made.columns),
+            **told.losses,
+            **settled,
+            **told.episodes,
+            **told.counts,
+            **told.levels,
         }
-        return row | counts_now | {k: means_now[k] for k in levels}
-
-    def _play(self) -> None:
-        """Fills the rollout."""
-        with one_torch_thread(self.env.device):
-            self.obs = collect(
-                self.env,
-                self._cloning or self.selfplay or self.agent,
-                self.rollout,
-                self.obs,
-                self.hyper.gamma,
-                on_step=self._watch,
-                bonuses=self.bonuses,
-            )
-        merge = getattr(self.env, "merge_ranks", None)
-        if self.ranks > 1 and merge is not None:  # what the environment learns from its episodes
-            merge()
-        if self.style is not None:
-            self.style.pay(self.rollout, self.env.reward_scale)
-
-    def _learn(self) -> dict[str, Tensor]:
-        """Learns from the rollout; returns () statistics."""
-        if self.iteration < self.first_learning:
-            if self.unseen is not None:
-                self.agent.obs_norm.adopt(self.unseen)
-            self.agent.obs_norm.commit()
-            return {}
-        learn = self.selfplay.learn if self.selfplay is not None else self.agent.update
-        losses = learn(self.rollout)
-        losses |= self.style.update() if self.style is not None else {}
-        if self._cloning is not None:
-            losses |= self._cloning.update(self.rollout, self.iteration)
-        return losses
-
-    @property
-    def _cloning(self) -> Cloning | None:
-        """In the first iterations of a run that clones, and always where fingers stay cloned."""
-        if self.cloning is not None:
-            self.cloning.leading = self.iteration < self.config.clone
-            if self.cloning.leading or self.config.clone_fingers:
-                return self.cloning
-        return None
-
-    def _number(self, x: Tensor | int) -> Tensor:
-        """(1,) float64 on the learner's device."""
-        return torch.as_tensor(x).double().to(self.device)[None]
-
-    def _share(self, stop_samples: int | None) -> float:
-        """Part of the run that is done, 0..1: the schedules' clock."""
-        share = 0.0 if stop_samples is None else self.samples / stop_samples
-        if self.config.minutes is not None:
-            share = max(share, self.minutes / self.config.minutes)
-        return min(share, 1.0)
 
     def _schedule(self, share: float) -> None:
-        c, h = self.config, self.hyper
-        if c.task == PRIOR:
-            self.agent.schedule(share)
-        if h.sigma_final is not None:
-            self.agent.sigma.fill_(h.sigma * (h.sigma_final / h.sigma) ** share)
-        resting = self.iteration < max(self.warmup, c.clone)  # only the critic learns by reward
+        """Sets what changes over the run; ``share`` of it is done."""
+        self.agent.schedule(share)
+        # While the actor rests, reward teaches the critic alone.
+        resting = self.now.iteration < max(self.now.warmup, self.config.clone)
         self.agent.actor_weight.fill_(0.0 if resting else 1.0)
         schedule = getattr(self.env, "schedule", None)
         if schedule is not None:  # an environment with a curriculum over the whole run
             schedule(share)
         if self.env.starts is not None:
-            first, last = c.start_probability
+            first, last = self.config.start_probability
             self.env.starts.probability = first + (last - first) * share
-        if self.imitation is not None:
-            left = max(0.0, 1.0 - share / c.imitation_share)
-            self.imitation.weight.fill_(c.imitation * left)
+        for part in self.parts:
+            part.schedule(share)
 
-    # -- files ----------------------------------------------------------------------------------
-
-    def _write_config(self) -> None:
-        c = self.config
-        c.out.mkdir(parents=True, exist_ok=True)
-        if c.prior is not None:
-            latent_run.keep_prior(self.env, c.out)
-        data = {
-            "config": dataclasses.asdict(replace(c, ppo=self.hyper, paper=False)),
-            "paper": c.paper,
-            "ranks": self.ranks,
-            "commit": provenance.commit(),
-            "versions": provenance.versions(),
-            "hardware": provenance.hardware(),
-        }
-        write_text(c.out / "config.json", json.dumps(data, indent=1, default=str))
-
-    def card(self) -> dict[str, Any]:
-        """What the policy file says about itself; see rl.policy."""
-        c, norm = self.config, self.agent.obs_norm
-        task = getattr(self.env, "task", None)
-        return {
-            "format": POLICY_FORMAT,
-            "task": c.task,
-            "algo": c.method,
-            "body": getattr(task, "body", "none"),
-            "strength": c.strength,
-            "limits": c.limits,
-            "obs_size": self.env.obs_size,
-            "action_size": self.env.action_size,
-            "obs_layout": {k: [s.start, s.stop] for k, s in self.env.obs_slices.items()},
-            "hidden": list(self.hyper.hidden),
-            "activation": self.hyper.activation,
-            "observation_clip": self.hyper.observation_clip,
-            "obs_mean": norm.mean.tolist(),
-            "obs_std": norm.std.tolist(),
-            "obs_count": float(norm.count),
-            "config": json.loads(json.dumps(dataclasses.asdict(c), default=str)),
-            "samples": self.samples,
-            "minutes": self.minutes,
-            "hardware": provenance.hardware(),
-            "commit": provenance.commit(),
-            "versions": provenance.versions(),
-            "metrics": dict(self.metrics),
-            **getattr(self.env, "card", {}),
-            **latent_run.card(self.env, self.agent),
-        }
-
-    def _save(self) -> Path:
-        state = {
-            "samples": self.samples,
-            "minutes": self.minutes,
-            "ranks": self.ranks,
-            "warmup": self.warmup,
-            "card": self.card(),
-        }
-        tensors = {f"agent/{k}": v for k, v in self.agent.state_dict().items()}
-        tensors |= {f"env/{k}": v for k, v in self.env.state_dict().items()}
-        tensors |= {f"meter/{k}": v for k, v in self.meter.state_dict().items()}
-        if self.style is not None:
-            tensors |= {f"style/{k}": v for k, v in self.style.state_dict().items()}
-        if self.cloning is not None:
-            tensors |= {f"cloning/{k}": v for k, v in self.cloning.state_dict().items()}
-        if self.selfplay is not None:
-            state["selfplay"] = self.selfplay.state()
-            tensors |= {f"selfplay/{k}": v for k, v in self.selfplay.state_dict().items()}
-        tensors["obs"] = self.obs
-        barrier = dist.barrier if self.ranks > 1 else None
-        return save_checkpoint(self.config.out, self.iteration, state, tensors, self.rank, barrier)
-
-    def _restore(self) -> Tensor:
-        """Takes the last checkpoint back; returns the observation to go on from."""
-        path = checkpoints(self.config.out)[-1]
-        saved = ranks_of(path)
-        state, tensors = load_checkpoint(path, self.rank % saved)
-
-        def part(prefix: str) -> dict[str, Tensor]:
-            return {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
-
-        self.agent.load_state_dict(part("agent/"))
-        self.env.load_state_dict(part("env/"))
-        self.meter.load_state_dict(part("meter/"))
-        if self.style is not None:
-            self.style.load_state_dict(part("style/"))
-        if self.cloning is not None:
-            self.cloning.load_state_dict(part("cloning/"))
-        if self.selfplay is not None:
-            self.selfplay.load(state["selfplay"], part("selfplay/"))
-        self.iteration, self.samples = state["iteration"], state["samples"]
-        self.minutes, self.warmup = state["minutes"], state["warmup"]
-        self.metrics = state["card"]["metrics"]
-        if saved < self.ranks and self.rank == 0 and not self.config.quiet:
-            print(
-                f"{path} has the worlds of {saved} processes: the others begin with copies of them",
-                flush=True,
+    def _play(self) -> None:
+        """Fills the rollout."""
+        rollout = self.made.rollout
+        actors = (part.actor(self.now.iteration) for part in self.parts)
+        with one_torch_thread(self.env.device):
+            self.now.obs = collect(
+                self.env,
+                next((a for a in actors if a is not None), self.agent),
+                rollout,
+                self.now.obs,
+                self.config.hyper.gamma,
+                on_step=self._watch,
+                bonuses=[part.bonus for part in self.parts if part.bonus is not None],
             )
-        if self.rank >= saved:  # the worlds of another rank, but not its future
-            part_of_run = 1_000_003 * self.rank + self.iteration
-            owners = (self.agent, self.env, self.style, self.selfplay)
-            for k, owner in enumerate(owners):
-                generator = getattr(owner, "generator", None)
-                if generator is not None:
-                    generator.manual_seed(self.config.seed + 7919 * k + part_of_run)
-        return tensors["obs"].to(self.env.device)
+        merge = getattr(self.env, "merge_ranks", None)
+        if self.ranks > 1 and merge is not None:  # what the environment learns from its episodes
+            merge()
+        for part in self.parts:
+            part.paid(rollout)
+
+    def _watch(self, result: Any) -> None:
+        self.made.meter(result)
+        for part in self.parts:
+            part.watch(result)
+
+    def _learn(self) -> dict[str, Tensor]:
+        """Learns from the rollout; returns () statistics."""
+        rollout = self.made.rollout
+        updates = (part.update for part in self.parts)
+        update = next((u for u in updates if u is not None), self.agent.update)
+        losses = update(rollout)
+        for part in self.parts:
+            losses |= part.learn(rollout, self.now.iteration)
+        return losses
+
+    def _look(self) -> dict[str, Tensor]:
+        """Takes in what observations are like, and learns nothing else."""
+        if self.made.unseen is not None:
+            self.agent.obs_norm.adopt(self.made.unseen)
+        self.agent.obs_norm.commit()
+        return {}
+
+    def _share(self) -> float:
+        """Part of the run that is done, 0..1: the schedules' clock."""
+        share = 0.0 if self.goal is None else self.now.samples / self.goal
+        if self.config.minutes is not None:
+            share = max(share, self.now.minutes / self.config.minutes)
+        return min(share, 1.0)
+
+    # -- what an iteration came to --------------------------------------------------------------
+
+    def _numbers(self, losses: dict[str, Tensor]) -> _Numbers:
+        """Numbers of all ranks, and the minutes so far. The one wait of an iteration."""
+        losses = losses | {"learning_rate": self.agent.learning_rate, "sigma": self.agent.sigma}
+        levels = {f"curriculum/{k}": x.float().mean() for k, x in self.env.curriculum.items()}
+        physics = getattr(self.env, "physics", None)
+        counts = {k: getattr(physics, k, 0) for k in ("nan_worlds", "overflow")}
+        episodes = self.made.meter.totals().to(self.device)
+        # Rank 0's clock decides for all: the others add 0 seconds.
+        seconds = time.monotonic() - self.began if self.rank == 0 else 0.0
+        own = (*counts.values(), torch.tensor(seconds, dtype=torch.float64))
+        totals, averages = over_ranks(
+            torch.cat([episodes, *(self._number(x) for x in own)]),
+            torch.cat([self._number(x) for x in (*losses.values(), *levels.values())]),
+        )
+        if self.ranks == 1:
+            # Seconds were read before the device had finished; the wait is over now.
+            self.now.minutes = (time.monotonic() - self.began) / 60.0
+        else:
+            self.now.minutes = totals[-1] / 60.0
+        return _Numbers(
+            losses=dict(zip(losses, averages)),
+            levels=dict(zip(levels, averages[len(losses) :])),
+            counts={k: int(v) for k, v in zip(counts, totals[len(episodes) :])},
+            episodes=self.made.meter.summary(totals),
+        )
+
+    def _number(self, x: Tensor | int) -> Tensor:
+        """(1,) float64 on the learner's device."""
+        return torch.as_tensor(x).double().to(self.device)[None]
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """What an iteration came to, of all ranks together."""
+
+    losses: dict[str, float]
+    """Statistics of the learning, and its rates."""
+    levels: dict[str, float]
+    """Of the curriculum, means over the worlds."""
+    counts: dict[str, int]
+    """Worlds in which the engine failed, so far."""
+    episodes: Row
+    """See rl.meter."""
 
 
 def main(args: list[str] | None = None) -> int:

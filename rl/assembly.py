@@ -1,0 +1,236 @@
+"""How a run is put together: environment, starts, learner, first policy, and the parts beside them.
+
+Nothing is played or written here. Every rank puts its own together, with worlds of its own and the
+same first weights.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from rl import latent_run
+from rl.checkpoint import checkpoints
+from rl.config import PRIOR, TRACKING, TrainConfig, load_placed_starts, load_starts
+from rl.host import local_ranks, pick_device
+from rl.meter import EpisodeMeter
+from rl.parts import ImitationReward, Impacts, Lesson, Opponents, Part, Style
+from rl.policy import read_policy
+from rl.ppo import PPO, STATISTICS
+from rl.ranks import own_rank
+from rl.rollout import Actor, Rollout
+from rl.warm_start import load_start
+from sports.env import Env, Starts, make_env
+from sports.physics.variation import Variation
+
+MakeEnv = Callable[[TrainConfig, int], Any]
+"""(config, seed) -> environment."""
+
+
+class Learner(Actor, Protocol):
+    """What the loop needs of a learner: a PPO, or the Distiller of the task ``prior``."""
+
+    obs_norm: Any
+    """Normaliser of observations."""
+    sigma: Tensor
+    learning_rate: Tensor
+    actor_weight: Tensor
+    """() set to 0 while the actor rests, else to 1."""
+
+    def new_rollout(self, rows: int) -> Rollout:
+        """Storage for ``rows`` = worlds x agents. Raises ValueError for too few."""
+        ...
+
+    def schedule(self, share: float) -> None:
+        """Sets its hyper-parameters for the part of the run that is done, 0..1."""
+        ...
+
+    def update(self, rollout: Rollout) -> dict[str, Tensor]:
+        """Learns from a rollout; returns () statistics."""
+        ...
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Everything that decides the next update, by name."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Takes a state back. Raises ValueError where it does not fit."""
+        ...
+
+
+@dataclass
+class Assembly:
+    """What a run is made of, in one process."""
+
+    config: TrainConfig
+    """As asked for, with the network of the first policy."""
+    rank: int
+    ranks: int
+    device: torch.device
+    """Of the learner."""
+    env: Any
+    agent: Learner
+    rollout: Rollout
+    meter: EpisodeMeter
+    parts: list[Part]
+    samples_each: int
+    """Samples of an iteration that are learned from, of all ranks."""
+    columns: tuple[str, ...]
+    """Of the log, empty in rows of iterations that do not learn."""
+    resumed: bool
+    """Whether there is a checkpoint to go on from."""
+    warmup: int
+    """Iterations in which only the critic learns."""
+    first_learning: int
+    """Iterations before anything learns: they show observations to the normaliser."""
+    unseen: Tensor | None
+    """(D,) bool features that the first policy, of another task, has never seen."""
+
+
+def assemble(config: TrainConfig, starts: Starts | None, make: MakeEnv) -> Assembly:
+    """Puts a run together. ``starts``: in the place of the clips' frames.
+
+    Raises ValueError for settings that cannot be, PolicyError for ``init``.
+    """
+    rank, ranks = own_rank()
+    device = pick_device(config.device)
+    resumed = config.resume and bool(checkpoints(config.out))
+    first = None if resumed else config.init
+    if first:
+        config = _shaped_like(config, first)
+    env = make(config, config.seed + 7919 * rank)
+    if starts is None:
+        starts = _starts_of_clips(config)
+    if starts is not None:
+        env.starts = starts.to(env.device)
+    parts: list[Part] = []
+    if config.imitation > 0.0:
+        if starts is None:
+            raise ValueError("the imitation reward needs demonstrations: give --clips")
+        parts.append(ImitationReward(config, env))
+    if config.impact > 0.0:
+        parts.append(Impacts(config, env))
+    if config.prior is not None:
+        latent_run.act_through_prior(env, config)
+    agent = _learner(config, env, device)
+    learned = env.num_worlds * env.num_agents
+    rollout = agent.new_rollout(learned)
+    if config.styled:
+        parts.append(Style(config, env, agent))
+    if config.clone > 0:
+        parts.append(Lesson(config, env, agent))
+    # Without any statistics the first rollout is for the observation normaliser only.
+    first_learning = 0 if config.init or config.task == PRIOR else 1
+    warmup, unseen = 0, None
+    if first:
+        warmup, unseen = _begin_from(first, config, env, agent)
+        first_learning = 0 if unseen is None else 1
+    if config.algo == "selfplay":
+        opponents = Opponents(config, env, agent)
+        parts.append(opponents)
+        learned = opponents.play.learned_rows
+    columns = () if config.task == PRIOR else STATISTICS
+    return Assembly(
+        config=config,
+        rank=rank,
+        ranks=ranks,
+        device=device,
+        env=env,
+        agent=agent,
+        rollout=rollout,
+        meter=EpisodeMeter(env),
+        parts=parts,
+        samples_each=rollout.steps * learned * ranks,
+        columns=(*columns, *(name for part in parts for name in part.columns)),
+        resumed=resumed,
+        warmup=warmup,
+        first_learning=first_learning,
+        unseen=unseen,
+    )
+
+
+def default_env(config: TrainConfig, seed: int) -> Env:
+    """The config's task on its engine, in training mode."""
+    physics_options = dict(config.physics_options)
+    if config.engine == "mujoco" and local_ranks() > 1:
+        each = max(1, (os.cpu_count() or 1) // local_ranks())
+        physics_options = {"threads": each} | physics_options
+    if config.vary:
+        physics_options |= {"variation": Variation(), "variation_seed": seed}
+    if config.task == PRIOR:
+        from rl.distillation import make_distillation_env
+
+        return make_distillation_env(config, seed, physics_options)
+    if config.task == TRACKING:
+        from rl.tracker import TrackingConfig, make_tracking_env
+
+        return make_tracking_env(
+            config.clips,
+            engine=config.engine,
+            num_worlds=config.num_worlds,
+            seed=seed,
+            strength=config.strength,
+            limits=config.limits,
+            config=TrackingConfig(**config.options),
+            physics_options=physics_options,
+            timestep_divisor=config.timestep_divisor,
+        )
+    return make_env(
+        config.task,
+        engine=config.engine,
+        num_worlds=config.num_worlds,
+        seed=seed,
+        strength=config.strength,
+        limits=config.limits,
+        training=True,
+        options=config.options,
+        physics_options=physics_options,
+        timestep_divisor=config.timestep_divisor,
+    )
+
+
+def _starts_of_clips(config: TrainConfig) -> Starts | None:
+    """Frames of the clips, where they are demonstrations of the task and not motions to follow."""
+    if not config.clips or config.task in (TRACKING, PRIOR):
+        return None
+    load = load_placed_starts if config.styled else load_starts
+    return load(config.clips, config.start_probability[0])
+
+
+def _learner(config: TrainConfig, env: Any, device: torch.device) -> Any:
+    """A PPO in all runs that have parts or a first policy; a Learner at least."""
+    bf16 = {"auto": None, "float32": False, "bfloat16": True}[config.precision]
+    if config.task == PRIOR:
+        return latent_run.make_distiller(config, env, device, bf16)
+    sizes = (env.obs_size, env.action_size)
+    return PPO(*sizes, config.hyper, device, config.seed, config.cuda_graph, bf16)
+
+
+def _shaped_like(config: TrainConfig, source: str) -> TrainConfig:
+    """The config with the network of the policy to begin from, unless the paper's is asked for."""
+    card = read_policy(source, config.task).metadata
+    if "hidden" not in card or config.paper:
+        return config
+    shape = {n: card[n] for n in ("hidden", "activation", "observation_clip")}
+    shape["hidden"] = tuple(shape["hidden"])
+    return replace(config, ppo=replace(config.ppo, **shape))
+
+
+def _begin_from(
+    source: str, config: TrainConfig, env: Any, agent: PPO
+) -> tuple[int, Tensor | None]:
+    """Takes the networks and statistics of another policy. Returns for how many iterations only the
+    critic learns, and (D,) bool the features that the policy has never seen, None without any."""
+    policy, unseen = load_start(source, env, config.task)
+    if policy.layer is not None:
+        raise ValueError("--init is a latent policy: give --prior as well")
+    assert policy.actor is not None
+    agent.load_policy(policy.actor, policy.mean, policy.std, policy.metadata["obs_count"])
+    critic = agent.load_critic(policy.extra)
+    warmup = 0 if critic else config.hyper.critic_warmup
+    return warmup, unseen.to(agent.device) if bool(unseen.any()) else None

@@ -1,0 +1,214 @@
+"""Plays a share of an evaluation's trials in one process, and keeps the episodes worth seeing.
+
+Every world plays the same number of episodes, one after another, with the policy's mean action.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from rl.host import one_torch_thread
+from rl.policy import Policy
+from rl.recording import Recording, Tape
+from sports.env import Env, Starts, StepResult, make_env
+from sports.registry import get_task
+from sports.starts import loose_joints
+
+START_FRAMES = 4096
+KEEP_ALL = 64
+"""A share of more trials keeps its best and its median only."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """A share of the trials, for one process."""
+
+    task: str
+    engine: str
+    trials: int
+    worlds: int
+    """At once, at most."""
+    seed: int
+    strength: str
+    limits: str
+    options: dict[str, Any]
+    physics_options: dict[str, Any]
+    timestep_divisor: int
+    start_noise: float
+    record: bool
+    """Keep what may turn out to be the best or the median."""
+    worlds_recorded: tuple[int, ...]
+    """Whose first episodes are kept."""
+
+
+@dataclass
+class Played:
+    """What a share came to. Trials in the order of their episodes, then of their worlds."""
+
+    trials: dict[str, np.ndarray]
+    recordings: dict[int, Recording]
+    """By trial; all that may turn out best or median."""
+    overflow: int
+    nan_worlds: int
+    timestep: float
+    """Of the engine (s): Drake may take more of them than the scene asks for."""
+    substeps: int
+
+
+def play_share(policy: Policy, share: Share, report: Callable[[int], None] | None = None) -> Played:
+    """Plays one in this process; ``report`` is called with the number of trials done."""
+    episodes = math.ceil(share.trials / share.worlds)
+    worlds = math.ceil(share.trials / episodes)
+    env = make_env(
+        share.task,
+        engine=share.engine,
+        num_worlds=worlds,
+        seed=share.seed,
+        strength=share.strength,  # type: ignore[arg-type]
+        limits=share.limits,  # type: ignore[arg-type]
+        training=False,
+        options=share.options,
+        physics_options=share.physics_options,
+        timestep_divisor=share.timestep_divisor,
+    )
+    try:
+        policy.check(env)
+        policy.to(env.device)
+        policy.seed(share.seed)
+        if share.start_noise > 0.0:
+            env.starts = standing_starts(env, share.start_noise, share.seed)
+        with one_torch_thread(env.device):
+            return _play_episodes(policy, share, env, episodes, report)
+    finally:
+        env.close()
+
+
+def standing_starts(env: Env, noise: float, seed: int) -> Starts:
+    """Frames of the standing start with joint noise +-``noise`` (rad), of agent 0."""
+    scene = env.physics.scene
+    generator = torch.Generator().manual_seed(seed)
+    start = torch.tensor(scene.default_qpos()[scene.agent_qpos(0)], dtype=torch.float32)
+    qpos = start.repeat(START_FRAMES, 1)
+    draw = 2.0 * torch.rand(qpos[:, 7:].shape, generator=generator) - 1.0
+    qpos[:, 7:] += noise * loose_joints(scene, qpos.device) * draw
+    qvel = torch.zeros(START_FRAMES, 6 + scene.body.num_dofs)
+    return Starts(qpos, qvel, {}, probability=1.0).to(env.device)
+
+
+def ranked(task: str, values: Mapping[str, np.ndarray], of: Iterable[int]) -> list[int]:
+    """Trials from worst to best: by the task's main metric, then by return."""
+    main = values[get_task(task).main_metric]
+    rank = np.where(np.isnan(main), -np.inf, main)
+    return sorted(of, key=lambda t: (rank[t], values["return"][t]))
+
+
+class _Episodes:
+    """Which episode each world is in, and what those that have ended came to."""
+
+    def __init__(self, env: Env, task: str, episodes: int) -> None:
+        """``episodes``: of each world."""
+        worlds, self.episodes = env.num_worlds, episodes
+        self.names, self.units = env.metric_names, get_task(task).metrics
+        self.current = np.zeros(worlds, dtype=int)
+        self.began = np.zeros(worlds, dtype=int)
+        self.returns, self.step = np.zeros(worlds), 0
+        columns = (*self.names, "return", "episode_steps")
+        self.table = {n: np.full((episodes, worlds), np.nan) for n in columns}
+        """(episodes, N) each"""
+        self.spans: dict[tuple[int, int], tuple[int, int]] = {}
+        """First step and end of (episode, world)."""
+
+    @property
+    def over(self) -> bool:
+        """Whether every world has played its episodes."""
+        return bool((self.current >= self.episodes).all())
+
+    def add(self, result: StepResult) -> bool:
+        """Takes a step in; whether anything ended with it."""
+        self.step += 1
+        bad = (~result.valid).cpu().numpy()
+        ended = result.ended.cpu().numpy() | bad
+        self.returns += np.where(bad, 0.0, result.reward.mean(-1).cpu().numpy())
+        if not ended.any():
+            return False
+        metrics = {n: result.metrics[n].double().cpu().numpy() for n in self.names}
+        for w in np.flatnonzero(ended).tolist():
+            e, began = int(self.current[w]), self.began[w]
+            if e < self.episodes:
+                for n in self.names:
+                    value, unit = metrics[n][w], self.units.get(n, "")
+                    self.table[n][e, w] = _settled(value, bad[w], unit)
+                self.table["return"][e, w] = self.returns[w]
+                self.table["episode_steps"][e, w] = self.step - began
+                self.spans[e, w] = (began, self.step)
+            self.current[w], self.began[w], self.returns[w] = e + 1, self.step, 0.0
+        return True
+
+
+def _play_episodes(
+    policy: Policy,
+    share: Share,
+    env: Env,
+    episodes: int,
+    report: Callable[[int], None] | None,
+) -> Played:
+    played = _Episodes(env, share.task, episodes)
+    tape = Tape(env, share.record or bool(share.worlds_recorded))
+    obs = env.reset()
+    while not played.over:
+        action = policy(obs)
+        result = env.step(action)
+        obs = result.obs
+        tape.add(action, result)
+        if played.add(result) and report is not None:
+            report(min(len(played.spans), share.trials))
+    # The last round may be one too many in the last worlds: left out by index, not by outcome.
+    trials = {n: x.flatten()[: share.trials] for n, x in played.table.items()}
+    physics = env.physics
+    return Played(
+        trials,
+        _recordings(share, env, played.spans, trials, tape),
+        int(physics.overflow),
+        int(physics.nan_worlds),
+        timestep=getattr(physics, "timestep", physics.scene.timestep),
+        substeps=getattr(physics, "substeps", physics.scene.substeps),
+    )
+
+
+def _recordings(
+    share: Share,
+    env: Env,
+    spans: dict[tuple[int, int], tuple[int, int]],
+    trials: dict[str, np.ndarray],
+    tape: Tape,
+) -> dict[int, Recording]:
+    """Of the trials that are asked for, or may turn out to be: by trial."""
+    taped = {
+        e * env.num_worlds + w: (w, start, end)
+        for (e, w), (start, end) in spans.items()
+        if e * env.num_worlds + w < share.trials and end <= len(tape.steps)
+    }
+    keep = {w for w in share.worlds_recorded if w in taped}  # trial w is world w's first episode
+    if share.record and taped:
+        order = ranked(share.task, trials, taped)
+        keep |= set(order if len(order) <= KEEP_ALL else (order[-1], order[len(order) // 2]))
+    common = ("task", "options", "seed", "engine", "strength", "limits", "timestep_divisor")
+    facts = {name: getattr(share, name) for name in common}
+    names = env.metric_names
+    return {
+        trial: tape.cut(*taped[trial], {n: float(trials[n][trial]) for n in names}, facts)
+        for trial in sorted(keep)
+    }
+
+
+def _settled(value: float, bad: bool, unit: str) -> float:
+    """A metric of an ended episode: one that diverged has failed, and achieved nothing else."""
+    if not bad or math.isnan(value):
+        return float(value)
+    return 0.0 if unit == "fraction" else math.nan
