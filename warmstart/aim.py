@@ -49,7 +49,7 @@ class Search:
     """Each starts from the episode that the one before found."""
     near: float = 0.5
     """A candidate that costs no more than this (m) is played in the task; the last one always."""
-    enough: float = 0.3
+    enough: float = 0.25
     """A played goal that costs no more than this (m) ends the search."""
     seed: int = 0
 
