@@ -172,6 +172,13 @@ def thrown_files(task: str) -> list[Path]:
     return sorted(folder.glob(f"{task}_*.npz"))
 
 
+def approach_files(task: str) -> list[Path]:
+    """The shipped episodes of a task that lead from its own start to a certified demonstration and
+    through it, as MuJoCo played them: ``warmstart/data/approaches/NAME.npz``."""
+    folder = Path(str(resources.files("warmstart").joinpath(DATA, "approaches")))
+    return sorted(folder.glob(f"{task}_*.npz"))
+
+
 def load_demonstrations(problem: str, strength: str | None = None) -> list[Clip]:
     """Shipped demonstrations of a problem: certified, tracked in MuJoCo, labelled with what they
     achieved. ``strength`` keeps those of one strength.

@@ -138,7 +138,7 @@ PROBLEMS: dict[str, Problem] = {
             summary="lunge whose point touches the opponent's chest at a given reach",
             outcome="reach",
             unit="m",
-            sweep=(1.9, 2.0, 2.1),
+            sweep=(1.9, 2.1),  # 2.0 is refused: 3.2 cm off in MuJoCo (docs/strikes.md)
             module="warmstart.problems.fencing",
         ),
         Problem(
