@@ -156,6 +156,10 @@ class MotionTables:
         """(N, n) hinge angles (rad) in frames (N,), within half a turn."""
         return self._rows[:, self._at[6]].index_select(0, frame)
 
+    def rates(self, frame: Tensor) -> Tensor:
+        """(N, n) hinge rates (rad/s) in frames (N,)."""
+        return self._rows[:, self._at[7]].index_select(0, frame)
+
     def contact(self, frame: Tensor) -> Tensor:
         """(N, B) in frames (N,): 1 for links on the ground, -1 for links off it, 0 where the
         motion leaves it open."""
