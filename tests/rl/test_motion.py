@@ -56,7 +56,7 @@ def test_kept_velocities_are_those_of_mujoco_in_the_frame_and_in_the_mirror():
 
 
 def test_a_jump_s_own_targets_lead_along_it_from_its_first_frame():
-    # From differences of its path instead of its velocities they lead 1.2 m elsewhere.
+    # From differences of its path instead of its velocities they lead 0.6 m elsewhere.
     clip = Clip.load(demonstration_files("long_jump_5m")[0])
     assert clip.ctrl is not None and clip.fps == 30.0
     motions = tables(clip)
