@@ -73,6 +73,9 @@ class Pack:
     archives: tuple[str, ...] = ()
     """Keep only these archives, as for a model without non-commercial data; by default all.
     Demonstrations of ``solve`` are the archive ``demonstrations``."""
+    supported: bool = False
+    """Leave out clips in which the athlete hovers: more than 5 cm off the ground, and not falling,
+    for more than 0.15 s. Nobody can follow them."""
 
 
 def main(args: Sequence[str]) -> int:
@@ -102,12 +105,17 @@ def main(args: Sequence[str]) -> int:
 
 def run_pack(config: Pack) -> int:
     """The command. Raises ValueError for sources without clips, or with clips of two bodies."""
+    from rl.hovering import supported
     from warmstart.atomic import prepare
     from warmstart.library import pack_files
 
     library = pack_files(config.clips)
     if config.archives:
         library = library.only(config.archives)
+    if config.supported:
+        library, hovering = supported(library)
+        for name, seconds in hovering:
+            print(f"left out: {name} hovers for {seconds:.2f} s")
     out = prepare(config.out)
     library.save(out)
     for archive, row in library.card()["archives"].items():

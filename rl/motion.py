@@ -1,7 +1,8 @@
 """Reference motions as flat tensors: every frame of every clip is a row, mirrored ones behind.
 
-A frame's row holds where all links are, how they move, and the hinge angles. Velocities come from
-differences of rotations along the tree of links, never of hinge angles: those wrap.
+A frame's row holds where all links are, how they move, and the hinge angles. Velocities are the
+library's where it has them; else they come from differences of rotations along the tree of links,
+never of hinge angles: those wrap.
 Each clip is followed by one frame more, its last moved on at its last velocities, so that every
 frame has a next.
 """
@@ -61,18 +62,24 @@ class LinkMotion:
     """(T, B, 3) world frame."""
 
 
-def link_motion(body: Body, qpos: np.ndarray, fps: float) -> LinkMotion:
+def link_motion(
+    body: Body, qpos: np.ndarray, fps: float, qvel: np.ndarray | None = None
+) -> LinkMotion:
     """Links of a path (T, 7 + n), T >= 2, and of one frame more behind it: (T + 1, ...).
 
-    Velocities are central differences of the root's place and of each joint's rotation, summed up
-    along the tree: v_child = v_parent + w_parent x arm (Featherstone 2008, section 5.3).
+    Velocities are those of ``qvel`` (T, 6 + n) or, without it, central differences of the root's
+    place and of each joint's rotation, summed up along the tree:
+    v_child = v_parent + w_parent x arm (Featherstone 2008, section 5.3).
     """
     angles = qpos[:, 7:].reshape(len(qpos), -1, 3)
-    spin = rotation.spin(rotation.from_hinges(angles), fps)
-    root_spin = rotation.spin(qpos[:, 3:7], fps)
-    rates = rotation.hinge_rates(angles, spin).reshape(len(qpos), -1)
-    linear = np.gradient(qpos[:, :3], 1.0 / fps, axis=0, edge_order=2 if len(qpos) > 2 else 1)
-    qvel = np.concatenate([linear, root_spin, rates], axis=1)
+    if qvel is None:
+        spin = rotation.spin(rotation.from_hinges(angles), fps)
+        rates = rotation.hinge_rates(angles, spin).reshape(len(qpos), -1)
+        linear = np.gradient(qpos[:, :3], 1.0 / fps, axis=0, edge_order=2 if len(qpos) > 2 else 1)
+        qvel = np.concatenate([linear, rotation.spin(qpos[:, 3:7], fps), rates], axis=1)
+    else:
+        spin = rotation.hinge_spin(angles, qvel[:, 6:].reshape(len(qpos), -1, 3))
+    linear, root_spin, rates = qvel[:, :3], qvel[:, 3:6], qvel[:, 6:]
     turned = rotation.multiply(qpos[-1, 3:7], rotation.exp(root_spin[-1] / fps))
     onward = np.concatenate(
         [qpos[-1, :3] + linear[-1] / fps, turned, qpos[-1, 7:] + rates[-1] / fps]
@@ -108,11 +115,12 @@ class MotionTables:
         self.num_links, self.num_dofs = body.num_links, body.num_dofs
         plain, seen = [], []
         for c in range(len(library.lengths)):
-            path = library.qpos(c)
-            still = np.zeros((len(path), 6 + body.num_dofs))
-            mirrored = Clip(fps=FPS, body=body.name, qpos=path, qvel=still).mirrored().qpos
-            plain.append(_rows(link_motion(body, path, FPS), geometry))
-            seen.append(_rows(link_motion(body, mirrored, FPS), geometry))
+            path, rates = library.qpos(c), library.qvel(c)
+            known = np.zeros((len(path), 6 + body.num_dofs)) if rates is None else rates
+            mirror = Clip(fps=FPS, body=body.name, qpos=path, qvel=known).mirrored()
+            turned = None if rates is None else mirror.qvel
+            plain.append(_rows(link_motion(body, path, FPS, rates), geometry))
+            seen.append(_rows(link_motion(body, mirror.qpos, FPS, turned), geometry))
         self._rows = torch.cat(plain + seen).to(self.device)
         """(2 F, W) float32, the fields of ``_at`` side by side."""
         lengths = library.lengths
@@ -147,6 +155,10 @@ class MotionTables:
     def joints(self, frame: Tensor) -> Tensor:
         """(N, n) hinge angles (rad) in frames (N,), within half a turn."""
         return self._rows[:, self._at[6]].index_select(0, frame)
+
+    def rates(self, frame: Tensor) -> Tensor:
+        """(N, n) hinge rates (rad/s) in frames (N,)."""
+        return self._rows[:, self._at[7]].index_select(0, frame)
 
     def contact(self, frame: Tensor) -> Tensor:
         """(N, B) in frames (N,): 1 for links on the ground, -1 for links off it, 0 where the

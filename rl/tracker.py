@@ -53,6 +53,9 @@ class TrackingConfig:
     other task, which is how a student of the tracker acts."""
     residual: float = 0.8
     """Radians by which an action of 1 moves a target off the reference's joint angle."""
+    feed_forward: bool = False
+    """Residual actions only: targets run ahead of the reference by what its motion costs in the
+    joints' damping (strength ``paper``: a tenth of a second), so that action 0 does not lag."""
     tolerance: tuple[float, float] = (0.5, 0.25)
     """Distance (m) of any link but the feet at which an episode ends, first and last."""
     sharpness: tuple[float, float, float, float] = (25.0, 5.0, 0.5, 0.1)
@@ -109,6 +112,10 @@ class Tracking:
         feet = [name.endswith(("Ankle", "Toe")) for name in body.link_names]
         self._not_feet = ~torch.tensor(feet, device=device)
         self._kp, self._effort = tensor(body.array("kp")), tensor(body.array("effort"))
+        # A target q + (kd / kp) dq makes a servo with passive damping pull by the differences of
+        # angle and rate alone; held for a control step it aims at the step's middle.
+        delay = body.array("kd") / body.array("kp") - 0.5 / FPS
+        self._lead = tensor(delay) if config.feed_forward else None
         self._weights = tensor(config.weights)
         self._ends = tensor(config.sharpness), tensor(config.sharpness_final)
         self.sharpness = self._ends[0].clone()
@@ -128,8 +135,18 @@ class Tracking:
     def targets(self, view: View, memory: Memory, action: Tensor) -> Tensor:
         """(N, 1, n) PD targets (rad) of actions in [-1, 1] around the next frame's pose."""
         qpos = view.physics.qpos[:, 7:]
-        reference = self.tables.joints(memory["frame"] + 1)
+        reference = self._aim(memory["frame"] + 1)
         return residual_targets(qpos, reference, action[:, 0], self.config.residual)[:, None]
+
+    def _aim(self, frame: Tensor) -> Tensor:
+        """(N, n) PD targets (rad) of action 0 on the way to frames (N,)."""
+        angle = self.tables.joints(frame)
+        if self._lead is None:
+            return angle
+        ahead = self._lead * self.tables.rates(frame)
+        # Further off a servo pulls no more.
+        most = self._effort / self._kp
+        return angle + torch.minimum(torch.maximum(ahead, -most), most)
 
     def start(
         self,
@@ -191,7 +208,7 @@ class Tracking:
         scores = self._weights * torch.exp(-self.sharpness * tracking_errors(body, reference))
         assert view.ctrl is not None
         ctrl = view.ctrl[:, 0]
-        action = wrapped(ctrl - self.tables.joints(frame)) / c.residual
+        action = wrapped(ctrl - self._aim(frame)) / c.residual
         servo = self._kp * (ctrl - view.physics.qpos[:, 7:])
         torque = torch.minimum(torch.maximum(servo, -self._effort), self._effort)
         power = (torque * view.physics.qvel[:, 6:]).abs().sum(-1)

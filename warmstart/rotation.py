@@ -70,6 +70,17 @@ def hinge_rates(angles: np.ndarray, spin: np.ndarray, damping: float = 0.02) -> 
     return np.stack([first, sz * wx + cz * wy, wz - sb * first], axis=-1)
 
 
+def hinge_spin(angles: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """(..., 3) angular velocity of a joint's child against its parent (rad/s, child's frame) from
+    its hinges' ``angles`` and ``rates`` (..., 3): what ``hinge_rates`` inverts."""
+    cb, sb = np.cos(angles[..., 1]), np.sin(angles[..., 1])
+    cz, sz = np.cos(angles[..., 2]), np.sin(angles[..., 2])
+    first, second, third = rates[..., 0], rates[..., 1], rates[..., 2]
+    return np.stack(
+        [cz * cb * first + sz * second, cz * second - sz * cb * first, sb * first + third], axis=-1
+    )
+
+
 def spin(quat: np.ndarray, fps: float) -> np.ndarray:
     """(T, ..., 3) angular velocity (rad/s, in the rotating frame) of (T, ..., 4) quaternions.
 

@@ -196,7 +196,9 @@ def test_the_label_of_a_flipped_clip_turns_the_joint_alike():
     x = qpos[:, 7:].reshape(len(qpos), -1, 3)
     x += math.pi
     x[..., 1] = 2 * math.pi - x[..., 1]
-    flipped = Clip(plain.fps, "smpl", qpos, plain.qvel)
+    qvel = plain.qvel.copy()
+    qvel[:, 7::3] *= -1.0  # the middle hinges turn the other way
+    flipped = Clip(plain.fps, "smpl", qpos, qvel, ctrl=plain.ctrl)  # simulated as well
     env = tracking_env(plain, flipped, worlds=2, assigned=[0, 1])
     obs = env.reset()
     assert float(env.tracking.tables.joints(env.memory["frame"])[1].abs().max()) > 3.0

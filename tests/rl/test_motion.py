@@ -12,7 +12,9 @@ from sports.physics import default_state, make_physics
 from sports.scene import humanoid_scene
 from tests.rl.motions_made import tables
 from tests.warmstart.clips_made import random_clip
+from warmstart.bank import demonstration_files
 from warmstart.clip import Clip
+from warmstart.replay import body_of
 
 BODY = load_body("smpl")
 
@@ -30,6 +32,42 @@ def test_links_of_a_frame_are_those_of_mujoco_in_the_frame_s_state():
     torch.testing.assert_close(reference.rot, physics.body_rot[:, 0], atol=2e-6, rtol=0)
     torch.testing.assert_close(reference.linvel, physics.body_linvel[:, 0], atol=2e-4, rtol=0)
     torch.testing.assert_close(reference.angvel, physics.body_angvel[:, 0], atol=2e-4, rtol=0)
+    physics.close()
+
+
+def test_kept_velocities_are_those_of_mujoco_in_the_frame_and_in_the_mirror():
+    made = random_clip(8)
+    qvel = np.random.default_rng(8).normal(0, 3, made.qvel.shape)
+    clip = Clip(30.0, "smpl", made.qpos, qvel, ctrl=made.qpos[:, 7:])
+    motions = tables(clip)
+    frame = torch.tensor([0, 7, 38, 39, 41, 60, 80])
+    scene = humanoid_scene(BODY)
+    physics = make_physics("mujoco", scene, len(frame))
+    state = default_state(scene, len(frame), "cpu")
+    state.qpos, state.qvel = motions.state(frame)
+    seen = clip.mirrored().qvel[[0, 19, 39]]  # each clip has a frame more behind it
+    kept = torch.tensor(np.concatenate([qvel[[0, 7, 38, 39]], seen]))
+    torch.testing.assert_close(state.qvel, kept.float(), rtol=2**-11, atol=1e-6)
+    physics.reset(torch.ones(len(frame), dtype=torch.bool), state)
+    reference = motions.at(frame)
+    torch.testing.assert_close(reference.linvel, physics.body_linvel[:, 0], atol=2e-4, rtol=0)
+    torch.testing.assert_close(reference.angvel, physics.body_angvel[:, 0], atol=2e-4, rtol=0)
+    physics.close()
+
+
+def test_a_jump_s_own_targets_lead_along_it_from_its_first_frame():
+    # From differences of its path instead of its velocities they lead 0.6 m elsewhere.
+    clip = Clip.load(demonstration_files("long_jump_5m")[0])
+    assert clip.ctrl is not None and clip.fps == 30.0
+    motions = tables(clip)
+    physics = make_physics("mujoco", humanoid_scene(body_of(clip)), 1)
+    state = default_state(physics.scene, 1, "cpu")
+    state.qpos, state.qvel = motions.state(torch.tensor([0]))
+    physics.reset(torch.ones(1, dtype=torch.bool), state)
+    for t in range(1, clip.num_frames):
+        physics.step(torch.tensor(clip.ctrl[t - 1 : t], dtype=torch.float32))
+        off = physics.body_pos[0, 0] - motions.at(torch.tensor([t])).pos[0]
+        assert torch.linalg.vector_norm(off, dim=-1).mean() < 0.02
     physics.close()
 
 

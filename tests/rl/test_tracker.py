@@ -225,6 +225,51 @@ def test_power_and_change_of_action_cost_what_they_say():
     env.close()
 
 
+def test_a_turning_wrist_lags_by_its_damping_and_with_feed_forward_does_not():
+    # In free fall, where nothing pulls at the joints. A target that is held at the next frame's
+    # angle leads by half a step; the servo's pull kp (target - q) balances kd dq.
+    rate, frames = 2.0, 25
+    t = np.arange(frames) / 30.0
+    qpos = np.zeros((frames, 76))
+    qpos[:, 2], qpos[:, 3] = 20.0 - 0.5 * 9.81 * t**2, 1.0
+    hinge = [dof.name for dof in BODY.dofs].index("L_Wrist_x")
+    qpos[:, 7 + hinge] = rate * t - 0.8
+    delay = BODY.array("kd")[hinge] / BODY.array("kp")[hinge] - 0.5 / 30.0
+    lags = []
+    for feed_forward in (False, True):
+        env = env_of(
+            library(Clip(30.0, "smpl", qpos, np.zeros((frames, 75)))),
+            1,
+            assigned=[0],
+            config={"feed_forward": feed_forward},
+        )
+        for _ in range(frames - 5):
+            env.step(torch.zeros(1, 1, 69))
+        frame = env.memory["frame"]
+        lag = env.tracking.tables.joints(frame) - env.physics.qpos[:, 7:]
+        lags.append(float(lag[0, hinge]))
+        env.close()
+    assert lags[0] == pytest.approx(rate * delay, rel=0.1)  # 9 degrees
+    assert abs(lags[1]) < 0.1 * rate * delay
+
+
+def test_feed_forward_reaches_no_further_than_the_servo_pulls():
+    clip = random_clip(4, 30)
+    fast = Clip(30.0, "smpl", clip.qpos, np.full_like(clip.qvel, 50.0), ctrl=clip.qpos[:, 7:])
+    env = env_of(library(fast), 1, assigned=[0], config={"feed_forward": True})
+    frame = env.memory["frame"]
+    ctrl = env.tracking.targets(env.view, env.memory, torch.zeros(1, 1, 69))[:, 0]
+    ahead = ctrl - env.tracking.tables.joints(frame + 1)
+    expected = torch.tensor(BODY.array("effort") / BODY.array("kp")).float()
+    torch.testing.assert_close(ahead[0], expected, atol=1e-4, rtol=0)
+    # What was done is known again from the targets.
+    action = 0.3 * torch.randn(1, 1, 69, generator=torch.Generator().manual_seed(0))
+    env.view.ctrl = env.tracking.targets(env.view, env.memory, action)
+    step = env.tracking.advance(env.view, env.memory)
+    torch.testing.assert_close(step.memory["action"], action[:, 0], atol=1e-4, rtol=0)
+    env.close()
+
+
 def test_episodes_end_off_the_reference_and_feet_may_be():
     clip = random_clip(3, 30)
     clip.qpos[:, 2] += 3.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -100,6 +101,29 @@ def test_an_hour_fits_thirty_megabytes(tmp_path):
     assert (tmp_path / "noise.npz").stat().st_size * 30 < 30e6
 
 
+def test_velocities_of_simulated_clips_are_kept_and_of_recordings_are_not(tmp_path):
+    recorded, clip = random_clip(0, 25), random_clip(1, 41, fps=60.0)
+    # Other velocities than differences would give; targets say that it was simulated.
+    qvel = clip.qvel + np.random.default_rng(0).normal(0, 3, clip.qvel.shape)
+    simulated = Clip(60.0, "smpl", clip.qpos, qvel, ctrl=clip.qpos[:, 7:])
+    library = pack([("a", recorded), ("b", simulated), ("c", random_clip(2, 30))])
+    library.save(tmp_path / "motions.npz")
+    again = Library.load(tmp_path / "motions.npz")
+    assert again.digest == library.digest
+    assert again.qvel(0) is None and again.qvel(2) is None
+    found = again.qvel(1)
+    assert found is not None and found.shape == (21, 75)
+    # Half precision: 11 bits.
+    np.testing.assert_allclose(found, qvel[::2], rtol=2**-11, atol=1e-6)
+    # A choice keeps them with their clip; one of recordings alone has none.
+    turned = again.chosen([2, 1])
+    np.testing.assert_array_equal(turned.qvel(1), found)
+    assert turned.qvel(0) is None and again.chosen([0, 2]).velocities is None
+    # Other velocities are another motion.
+    other = pack([("a", recorded), ("b", replace(simulated, qvel=clip.qvel))])
+    assert other.digest != library.chosen([0, 1]).digest
+
+
 def test_shipped_demonstrations_pack_with_licence_and_sport():
     library = pack_files([demonstration_files("high_jump")[0], demonstration_files("tennis")[0]])
     assert {o.tag for o in library.origins} == {"high_jump", "tennis"}
@@ -138,6 +162,8 @@ def test_wrong_files_are_refused(tmp_path):
 
 def test_a_damaged_library_is_refused(tmp_path):
     library = pack(named(3))
+    some = np.zeros((int(library.lengths.sum()), 75), np.float16)
+    some[5] = np.nan
     arrays = {
         "lengths": library.lengths.astype(np.int32),
         "root": library.root.astype(np.float32),
@@ -156,6 +182,8 @@ def test_a_damaged_library_is_refused(tmp_path):
         ({"joints": arrays["joints"][:, :-1]}, "frames are not those of body 'smpl'"),
         ({"root": np.full_like(arrays["root"], np.nan)}, "not finite"),
         ({"root": 0 * arrays["root"]}, "not of length 1"),
+        ({"velocities": some}, "velocities that are not finite"),
+        ({"velocities": some[:, 1:]}, "velocities are not those of body 'smpl'"),
     ):
         write_npz(path, arrays | change, head)
         with pytest.raises(ValueError, match=sentence):
