@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -182,6 +183,12 @@ def test_fingers_go_on_learning_their_labels_while_other_joints_stay(env, clip):
     fingers = [i for i, dof in enumerate(names) if dof.link[2:].startswith(FINGERS)]
     others = [i for i in range(len(names)) if i not in fingers]
     assert len(fingers) == 90 and learner.fingers.tolist() == fingers
+    noise = rollout.action - rollout.mean
+    assert noise[..., fingers].abs().max() == 0.0
+    assert noise[..., others].std() == pytest.approx(SMALL.sigma, rel=0.1)
+    z = (noise[..., others] / SMALL.sigma).square().sum(-1)
+    wanted = -0.5 * z - len(names) * (math.log(SMALL.sigma) + 0.5 * math.log(2.0 * math.pi))
+    torch.testing.assert_close(rollout.log_prob, wanted)
 
     def error(joints: list[int], target: torch.Tensor) -> float:
         with torch.no_grad():
