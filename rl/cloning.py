@@ -11,8 +11,8 @@ the critic learns from the task's rewards as ever.
 What a hand does in a throw is timing alone, and noise spoils what reinforcement learns of it: a
 javelin thrower that is paid for each metre holds on until the noise of its fingers shakes the
 javelin loose, and without noise never lets go. ``fingers`` keeps the fingers at the
-demonstration's targets for the whole run, without noise: with it rewards pull them off faster than
-lessons bring them back. The rest of the body learns by reward.
+demonstration's targets for the whole run, without noise that rewards could follow. The rest of the
+body learns by reward.
 """
 
 from __future__ import annotations
