@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from rl.discriminator import Replay, discriminator_losses, style_reward
 from rl.graph import GraphedStep
 from rl.learned import learned_state, load_learned
-from rl.networks import MLP
+from rl.networks import MLP, autocast
 from rl.normalizer import Normalizer
 from rl.ranks import SharedGradients, SharedStep, own_rank
 from rl.rollout import Rollout
@@ -227,9 +227,7 @@ class AMP:
         return self.norm.normalize(windows.float()).flatten(1)
 
     def _autocast(self) -> torch.autocast:
-        return torch.autocast(
-            self.device.type, dtype=torch.bfloat16, enabled=self.bf16, cache_enabled=False
-        )
+        return autocast(self.device, self.bf16)
 
     # -- learning -------------------------------------------------------------------------------
 

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from rl.ppo import PPO, gaussian_log_prob
 from rl.rollout import Rollout
-from sports.humanoid.body import FINGERS
+from sports.humanoid.body import is_finger
 from warmstart.bank import START, elapsed
 from warmstart.clip import Clip
 
@@ -94,9 +94,8 @@ class Cloning:
         """Whether the demonstration is played, or only its fingers' labels are kept in mind."""
         self.fingers: Tensor | None = None
         if fingers:
-            own = tuple(f"{side}_{finger}" for side in "LR" for finger in FINGERS)
             dofs = env.physics.scene.body.dofs
-            found = [i for i, dof in enumerate(dofs) if dof.link.startswith(own)]
+            found = [i for i, dof in enumerate(dofs) if is_finger(dof.link)]
             if not found:
                 raise ValueError("the task's body has no fingers whose targets could be kept")
             self.fingers = torch.tensor(found, device=self.device)
@@ -135,8 +134,9 @@ class Cloning:
         moves the other joints, too, further in an iteration than their rewards do.
         """
         c, share = self.agent.config, min(done / max(self.iterations, 1), 1.0)
-        self.rate.fill_(RATES[0] * (RATES[1] / RATES[0]) ** share)
-        if not self.leading:
+        if self.leading:
+            self.rate.fill_(RATES[0] * (RATES[1] / RATES[0]) ** share)
+        else:
             self.rate.copy_(self.agent.learning_rate)
         obs, label = rollout.obs.flatten(0, 1), rollout.mean.flatten(0, 1)
         if not self.leading and self.fingers is not None:

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from rl.graph import GraphedStep
 from rl.learned import learned_state, load_learned
+from rl.networks import autocast
 from rl.policy import Policy
 from rl.prior import FORMAT, LatentNets, Shape, body_digest, check_layout, self_layout
 from rl.ranks import SharedGradients, SharedStep, own_rank
@@ -242,9 +243,7 @@ class Distiller:
     # -- acting ---------------------------------------------------------------------------------
 
     def _autocast(self) -> torch.autocast:
-        return torch.autocast(
-            self.device.type, dtype=torch.bfloat16, enabled=self.bf16, cache_enabled=False
-        )
+        return autocast(self.device, self.bf16)
 
     def prepare(self, obs: Tensor) -> Tensor:
         """(M, D) raw observations -> normalised, in the storage type. NaN becomes 0."""

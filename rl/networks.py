@@ -20,6 +20,12 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {
 }
 
 
+def autocast(device: torch.device, bf16: bool) -> torch.autocast:
+    """How a learner's networks multiply: in bf16 where that was asked for."""
+    # Without the cache: casts made inside a captured graph must not outlive it.
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=bf16, cache_enabled=False)
+
+
 class MLP(nn.Module):
     """(..., inputs) -> (..., outputs), float32.
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from rl.graph import GraphedStep
 from rl.learned import learned_state, load_learned
-from rl.networks import MLP, Activation
+from rl.networks import MLP, Activation, autocast
 from rl.normalizer import Normalizer
 from rl.ppo_losses import (
     bounds_excess,
@@ -212,10 +212,7 @@ class PPO:
 
     def autocast(self) -> torch.autocast:
         """How the networks multiply: in bf16 where that was asked for."""
-        # Without the cache: casts made inside a captured graph must not outlive it.
-        return torch.autocast(
-            self.device.type, dtype=torch.bfloat16, enabled=self.bf16, cache_enabled=False
-        )
+        return autocast(self.device, self.bf16)
 
     def prepare(self, obs: Tensor) -> Tensor:
         """(M, D) raw observations -> normalised, in the storage type. NaN becomes 0."""

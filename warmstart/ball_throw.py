@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +25,9 @@ import torch
 
 from sports.env import Env, make_env
 from sports.humanoid.body import Strength
-from warmstart.bank import START
 from warmstart.clip import Clip
 from warmstart.cross_entropy import CrossEntropy
-from warmstart.performance import perform
+from warmstart.performance import numbers_near, perform, searched_clip
 
 TASK, BALL = "free_throw", "ball"
 JOINTS = tuple(f"{link}_{axis}" for link in ("Shoulder", "Elbow", "Wrist") for axis in "xyz")
@@ -138,21 +137,7 @@ def throw(thrower: Thrower, numbers: np.ndarray) -> Clip:
 
     targets = offset + np.array(action) * scale
     played = perform(TASK, thrower.strength, BALL, targets, watch)
-    events = {START: 0.0}
-    if True in played.seen:
-        # Frame k is before step k: the last frame after a step in which a hand touched the ball.
-        first = played.seen.index(True)
-        events["release"] = (max(k for k in range(first) if touched[k]) + 1) / played.clip.fps
-    meta = {
-        "problem": TASK,
-        "achieved": {name: round(value, 6) for name, value in played.metrics.items()},
-        "strength": thrower.strength,
-        "source": "searched in MuJoCo, thrown by the task's own athlete",
-        "licence": "Apache-2.0",
-        "events": events,
-        "numbers": [round(float(x), 6) for x in numbers],
-    }
-    return replace(played.clip, meta=meta)
+    return searched_clip(played, touched, TASK, thrower.strength, numbers)
 
 
 def search(
@@ -195,15 +180,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=Search.seed)
     parser.add_argument("--near", type=Path, help="a clip of this command, to search around")
     options = parser.parse_args(arguments)
-    near = None
-    if options.near is not None:
-        try:
-            near = np.array(Clip.load(options.near).meta.get("numbers", ()), dtype=float)
-            if near.shape != UNITS.shape:
-                raise ValueError(f"it is not a clip of this command ({len(UNITS)} numbers)")
-        except ValueError as error:
-            print(f"{options.near}: {error}", file=sys.stderr)
-            return 2
+    try:
+        near = numbers_near(options.near, len(UNITS))
+    except ValueError as error:
+        print(f"{options.near}: {error}", file=sys.stderr)
+        return 2
 
     def progress(done: int, cost: float, baskets: float) -> None:
         print(f"round {done}: cost {cost:.2f}, baskets {100 * baskets:.0f} %", flush=True)

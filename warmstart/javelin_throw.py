@@ -18,7 +18,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -32,10 +32,9 @@ from sports.javelin import AIM, HOLD_STEPS
 from sports.physics.base import GRAVITY
 from sports.scene import Scene, humanoid_scene
 from warmstart import rotation, thrown
-from warmstart.bank import START
 from warmstart.clip import Clip
 from warmstart.cross_entropy import CrossEntropy
-from warmstart.performance import perform
+from warmstart.performance import numbers_near, perform, searched_clip
 from warmstart.tracking import Worlds
 
 TASK = "javelin"
@@ -299,22 +298,7 @@ def throw(thrower: Thrower, numbers: np.ndarray) -> Clip:
         return bool(env.memory["released"][0])
 
     played = perform(TASK, strength, scene.free_objects[0].name, ctrl, released)
-    clip, achieved = played.clip, played.metrics
-    events = {START: 0.0}
-    if True in played.seen:
-        # Frame k is before step k: the last frame after a step in which a finger touched it.
-        first = played.seen.index(True)
-        events["release"] = (max(k for k in range(first) if touched[k]) + 1) / clip.fps
-    meta = {
-        "problem": TASK,
-        "achieved": {name: round(value, 6) for name, value in achieved.items()},
-        "strength": strength,
-        "source": "searched in MuJoCo, thrown by the task's own athlete",
-        "licence": "Apache-2.0",
-        "events": events,
-        "numbers": [round(float(x), 6) for x in numbers],
-    }
-    return replace(clip, meta=meta)
+    return searched_clip(played, touched, TASK, strength, numbers)
 
 
 def length_of(clip: Clip) -> float:
@@ -367,15 +351,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--near", type=Path, help="a clip of this command, to search around")
     options = parser.parse_args(arguments)
     settings = Search(rounds=options.rounds, asked=options.asked, seed=options.seed)
-    near = None
-    if options.near is not None:
-        try:
-            near = np.array(Clip.load(options.near).meta.get("numbers", ()), dtype=float)
-            if near.shape != UNITS.shape:
-                raise ValueError(f"it is not a clip of this command ({len(UNITS)} numbers)")
-        except ValueError as error:
-            print(f"{options.near}: {error}", file=sys.stderr)
-            return 2
+    try:
+        near = numbers_near(options.near, len(UNITS))
+    except ValueError as error:
+        print(f"{options.near}: {error}", file=sys.stderr)
+        return 2
 
     def progress(done: int, flown: float) -> None:
         print(f"round {done}: {flown:.2f} m", flush=True)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from sports.env import Env, make_env
 from sports.humanoid.body import Strength
+from warmstart.bank import START
 from warmstart.clip import Clip
 
 RETURN = 0.7
@@ -28,6 +30,43 @@ class Performance:
     """Of the task at the end, where they are defined."""
     seen: list[bool]
     """What ``watch`` said after each step."""
+
+
+def searched_clip(
+    played: Performance, touched: Sequence[bool], task: str, strength: Strength, numbers: np.ndarray
+) -> Clip:
+    """The clip of a throw that was searched for, with what it achieved, the numbers (P,) it was
+    made from, when it began and, where it was one, when it was released.
+
+    ``touched`` says after which steps the athlete touched the object, ``played.seen`` after which
+    the rules called it released.
+    """
+    events = {START: 0.0}
+    if True in played.seen:
+        # Frame k is before step k: the last frame after a step in which a hand touched it.
+        first = played.seen.index(True)
+        events["release"] = (max(k for k in range(first) if touched[k]) + 1) / played.clip.fps
+    meta = {
+        "problem": task,
+        "achieved": {name: round(value, 6) for name, value in played.metrics.items()},
+        "strength": strength,
+        "source": "searched in MuJoCo, thrown by the task's own athlete",
+        "licence": "Apache-2.0",
+        "events": events,
+        "numbers": [round(float(x), 6) for x in numbers],
+    }
+    return replace(played.clip, meta=meta)
+
+
+def numbers_near(path: Path | None, size: int) -> np.ndarray | None:
+    """The numbers (size,) of a searched clip, to search around; None without a file. Raises
+    ValueError for a clip that this search did not make."""
+    if path is None:
+        return None
+    near = np.array(Clip.load(path).meta.get("numbers", ()), dtype=float)
+    if near.shape != (size,):
+        raise ValueError(f"it is not a clip of this command ({size} numbers)")
+    return near
 
 
 def perform(
