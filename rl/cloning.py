@@ -11,8 +11,8 @@ the critic learns from the task's rewards as ever.
 What a hand does in a throw is timing alone, and noise spoils what reinforcement learns of it: a
 javelin thrower that is paid for each metre holds on until the noise of its fingers shakes the
 javelin loose, and without noise never lets go. ``fingers`` keeps the fingers at the
-demonstration's targets for the whole run, without noise that rewards could follow. The rest of the
-body learns by reward.
+demonstration's targets for the whole run, without noise that rewards could follow, and outside of
+the policy gradient (``PPO.noisy``). The rest of the body learns by reward.
 """
 
 from __future__ import annotations
@@ -115,12 +115,11 @@ class Cloning:
     def act(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """obs (M, D) raw -> stored obs, action, label (in the mean's place), log-prob of the action
         by the actor: the critic's update, which comes first, then finds ratios of 1."""
+        if not self.leading and self.fingers is not None:
+            self.agent.noisy[self.fingers] = 0.0  # no noise that rewards could follow
         stored, action, mean, log_prob = self.agent.act(obs)
         if not self.leading:
             self._labels.append(self.labels())
-            if self.fingers is not None:  # no noise that rewards could follow
-                action[:, self.fingers] = mean[:, self.fingers]
-                log_prob = gaussian_log_prob(action, mean, self.agent.sigma)
             return stored, action, mean, log_prob
         label, noise = self.labels(), action - mean
         action = torch.where(self.led[:, None], label, mean) + noise

@@ -167,6 +167,8 @@ class PPO:
         self.learning_rate = scalar(config.learning_rate)
         self.actor_weight = scalar(1.0)
         """0 while only the critic learns."""
+        self.noisy = torch.ones(action_size, device=self.device)
+        """(U,) 1 where the action has noise and the policy gradient counts; 0 elsewhere."""
         cuda = self.device.type == "cuda"
         self.bf16 = cuda if bf16 is None else bf16
         self.obs_dtype = torch.bfloat16 if cuda and self.bf16 else torch.float32
@@ -231,8 +233,16 @@ class PPO:
         with self.autocast():
             mean = self.actor(stored)
         noise = torch.randn(mean.shape, device=self.device, generator=self.generator)
-        action = mean + self.sigma * noise
-        return stored, action, mean, gaussian_log_prob(action, mean, self.sigma)
+        action = mean + self.sigma * self.noisy * noise
+        return stored, action, mean, self.log_prob(action, mean)
+
+    def log_prob(self, action: Tensor, mean: Tensor) -> Tensor:
+        """(...) log density of those parts of action (..., U) that have noise.
+
+        Of a part without noise the action is the mean that it was drawn at: any step of that mean
+        would lower its density, after good actions and bad ones alike.
+        """
+        return gaussian_log_prob(action, mean, self.sigma, self.noisy)
 
     @torch.no_grad()
     def value(self, stored: Tensor) -> Tensor:
@@ -326,7 +336,7 @@ class PPO:
         with self.autocast():
             mean = self.actor(b["obs"])
             value = self.critic(b["obs"]).squeeze(-1)
-        ratio = (gaussian_log_prob(b["action"], mean, self.sigma) - b["log_prob"]).exp()
+        ratio = (self.log_prob(b["action"], mean) - b["log_prob"]).exp()
         policy_loss = (weight * surrogate_loss(ratio, b["advantage"], c.clip_ratio)).mean()
         bounds_loss = (weight * bounds_excess(mean)).mean()
         error = clipped_value_error(value, b["target"], b["value"], c.value_clip)
@@ -334,7 +344,8 @@ class PPO:
         actor_loss = policy_loss + c.bounds_coefficient * bounds_loss
         (self.actor_weight * actor_loss + c.critic_coefficient * value_loss).backward()
         with torch.no_grad():
-            kl = (weight * gaussian_divergence(mean, b["mean"], self.sigma)).mean()
+            divergence = gaussian_divergence(mean, b["mean"], self.sigma, self.noisy)
+            kl = (weight * divergence).mean()
             clipped = (weight * ((ratio - 1.0).abs() > c.clip_ratio)).mean()
             return torch.stack((kl, clipped, policy_loss, value_loss, bounds_loss))
 

@@ -8,17 +8,25 @@ import torch
 from torch import Tensor
 
 
-def gaussian_log_prob(action: Tensor, mean: Tensor, sigma: Tensor) -> Tensor:
-    """(...) log density of action (..., U) under N(mean, sigma^2), float32."""
+def gaussian_log_prob(
+    action: Tensor, mean: Tensor, sigma: Tensor, noisy: Tensor | None = None
+) -> Tensor:
+    """(...) log density of action (..., U) under N(mean, sigma^2), float32; of the parts where
+    ``noisy`` (U,) is 1, if it is given. (The constant is that of all U: ratios do not see it.)"""
     z = (action - mean) / sigma
+    if noisy is not None:
+        z = z * noisy
     constant = action.shape[-1] * (sigma.log() + 0.5 * math.log(2.0 * math.pi))
     return -0.5 * z.square().sum(-1) - constant
 
 
-def gaussian_divergence(mean: Tensor, other: Tensor, sigma: Tensor) -> Tensor:
+def gaussian_divergence(
+    mean: Tensor, other: Tensor, sigma: Tensor, noisy: Tensor | None = None
+) -> Tensor:
     """(...) KL divergence (nats) between N(mean, sigma^2) and N(other, sigma^2), (..., U) each:
-    |mean - other|^2 / (2 sigma^2), whichever comes first."""
-    return (mean - other).square().sum(-1) / (2.0 * sigma.square())
+    |mean - other|^2 / (2 sigma^2), whichever comes first; of the parts where ``noisy`` is 1."""
+    apart = mean - other if noisy is None else (mean - other) * noisy
+    return apart.square().sum(-1) / (2.0 * sigma.square())
 
 
 def surrogate_loss(ratio: Tensor, advantage: Tensor, clip_ratio: float) -> Tensor:

@@ -124,6 +124,27 @@ def test_one_minibatch_step_is_the_reference_step():
             torch.testing.assert_close(ours[name], theirs[name], rtol=1e-4, atol=2e-6)
 
 
+def test_no_policy_gradient_where_the_action_has_no_noise():
+    """Several minibatches: from the second on a mean without noise is not the action any more, and
+    a plain ratio would push it further, down or up as the advantage says."""
+    config = PPOConfig(hidden=(16,), steps=5, minibatches=3, epochs=4, sigma=0.2)
+    agent = PPO(3, 4, config, seed=1)
+    agent.noisy[2:] = 0.0
+    rollout, raw = filled_rollout(agent, 30, seed=5)
+    drawn = [agent.act(x) for x in raw]
+    for name, k in (("action", 1), ("mean", 2), ("log_prob", 3)):
+        getattr(rollout, name).copy_(torch.stack([step[k] for step in drawn]))
+    assert torch.equal(rollout.action[..., 2:], rollout.mean[..., 2:])
+    assert (rollout.action - rollout.mean)[..., :2].std() == pytest.approx(0.2, rel=0.2)
+    before = agent.actor.head.weight.detach().clone()
+    stats = agent.update(rollout)
+    moved = (agent.actor.head.weight - before).abs().amax(1)
+    assert (moved[:2] > 0).all() and torch.equal(moved[2:], torch.zeros(2))
+    mean = agent.actor(rollout.obs).detach()
+    apart = (mean - rollout.mean)[..., :2] / agent.sigma  # the hidden layer moved the others, too
+    assert 0 < float(stats["kl"]) < 4 * float(0.5 * apart.square().sum(-1).mean())
+
+
 def test_permuted_worlds_learn_the_same():
     config = PPOConfig(hidden=(16,), steps=4, minibatches=1, epochs=3)
     agents = [PPO(3, 2, config, seed=1) for _ in range(2)]
