@@ -231,8 +231,9 @@ def config_from_dict(data: dict[str, Any]) -> TrainConfig:
     try:
         data = dict(data)
         ppo = dict(data.pop("ppo"))
-        for name in ("hidden", "kl_band", "learning_rate_limits"):
-            ppo[name] = tuple(ppo[name]) if ppo[name] is not None else None
+        for name in ("hidden", "kl_band", "kl_band_final", "learning_rate_limits"):
+            if ppo.get(name) is not None:  # runs of older versions lack the newer ones
+                ppo[name] = tuple(ppo[name])
         amp = dict(data.pop("amp", {}))  # none in runs of versions without it
         amp |= {"hidden": tuple(amp["hidden"])} if "hidden" in amp else {}
         rivals = dict(data.pop("selfplay", {}))

@@ -62,6 +62,9 @@ class PPOConfig:
     kl_band: tuple[float, float] | None = (0.008, 0.03)
     """The actor's rate falls where the KL divergence of a minibatch (nats, summed over the action)
     is above the band and rises where it is below; None keeps it constant."""
+    kl_band_final: tuple[float, float] | None = None
+    """The band at the end of the run, reached geometrically; None keeps the first one. Where the
+    gradient is mostly noise, what is learned at the end is what smaller steps average."""
     learning_rate_limits: tuple[float, float] = (1e-5, 1e-3)
     """The KL control stays between these."""
     learning_rate_factor: float = 1.5
@@ -86,6 +89,8 @@ class PPOConfig:
             raise ValueError("entropy_coefficient must be 0: this policy's sigma is not learned")
         if not 0.0 < self.sigma or (self.sigma_final is not None and self.sigma_final <= 0.0):
             raise ValueError(f"sigma must be positive, not {self.sigma}, {self.sigma_final}")
+        if self.kl_band_final is not None and self.kl_band is None:
+            raise ValueError("kl_band_final needs a kl_band to begin with")
         if min(self.steps, self.minibatches, self.epochs) < 1:
             raise ValueError("steps, minibatches and epochs must be at least 1")
 
@@ -117,11 +122,14 @@ PAPER = replace(
 """Hyper-parameters of the SMPLOlympics paper (arXiv 2407.00187); run it with 2048 worlds."""
 
 
-def adapted_rate(rate: Tensor, kl: Tensor, config: PPOConfig) -> Tensor:
-    """() learning rate after a minibatch of divergence ``kl``, on the device."""
+def adapted_rate(rate: Tensor, kl: Tensor, config: PPOConfig, band: Tensor | None = None) -> Tensor:
+    """() learning rate after a minibatch of divergence ``kl``, on the device; ``band`` (2,) instead
+    of the configuration's."""
     if config.kl_band is None:
         return rate
     (low, high), (least, most) = config.kl_band, config.learning_rate_limits
+    if band is not None:
+        low, high = band.unbind()
     slower = (rate / config.learning_rate_factor).clamp(min=least)
     faster = (rate * config.learning_rate_factor).clamp(max=most)
     return torch.where(kl > high, slower, torch.where(kl < low, faster, rate))
@@ -165,6 +173,8 @@ class PPO:
 
         self.sigma = scalar(config.sigma)
         self.learning_rate = scalar(config.learning_rate)
+        self.kl_band = torch.tensor(config.kl_band or (0.0, 0.0), device=self.device)
+        """(2,) of the present part of the run."""
         self.actor_weight = scalar(1.0)
         """0 while only the critic learns."""
         self.noisy = torch.ones(action_size, device=self.device)
@@ -205,8 +215,11 @@ class PPO:
         return Rollout(c.steps, rows, *sizes, self.device, self.obs_dtype)
 
     def schedule(self, share: float) -> None:
-        """Sets sigma for the part of the run that is done, 0..1."""
+        """Sets sigma and the KL band for the part of the run that is done, 0..1."""
         c = self.config
+        if c.kl_band is not None and c.kl_band_final is not None:
+            for i, (first, last) in enumerate(zip(c.kl_band, c.kl_band_final)):
+                self.kl_band[i] = first * (last / first) ** share
         if c.sigma_final is not None:
             self.sigma.fill_(c.sigma * (c.sigma_final / c.sigma) ** share)
 
@@ -353,7 +366,7 @@ class PPO:
     def _descend(self, stats: Tensor) -> None:
         """Steps along the gradients; ``stats`` (5,) of the samples decide the actor's rate."""
         c = self.config
-        adapted = adapted_rate(self.learning_rate, stats[0], c)
+        adapted = adapted_rate(self.learning_rate, stats[0], c, self.kl_band)
         # A resting actor diverges from nothing: its rate must not climb meanwhile.
         self.learning_rate.copy_(torch.lerp(self.learning_rate, adapted, self.actor_weight))
         self._stats += stats

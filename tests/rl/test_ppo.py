@@ -192,6 +192,22 @@ def test_rate_follows_the_divergence_within_its_limits():
     assert adapted_rate(rate, torch.tensor(1.0), fixed) == rate
 
 
+def test_the_band_moves_geometrically_and_the_control_follows_it():
+    config = PPOConfig(kl_band=(0.04, 0.1), kl_band_final=(0.01, 0.025), learning_rate=1e-4)
+    agent = PPO(3, 2, config)
+    stats = torch.tensor([0.03, 0.0, 0.0, 0.0, 0.0])  # below the first band, above the last one
+    for share, low, direction in ((0.0, 0.04, 1), (0.5, 0.02, 0), (1.0, 0.01, -1)):
+        agent.schedule(share)
+        assert agent.kl_band.tolist() == pytest.approx([low, 2.5 * low])
+        agent.learning_rate.fill_(1e-4)
+        for p in agent._named_parameters().values():
+            p.grad = torch.zeros_like(p)
+        agent._descend(stats)
+        assert float(agent.learning_rate) == pytest.approx(1e-4 * 1.5**direction)
+    with pytest.raises(ValueError, match="needs a kl_band"):
+        PPOConfig(kl_band=None, kl_band_final=(0.01, 0.02))
+
+
 def test_control_keeps_the_divergence_of_a_run_near_its_band(tmp_path):
     """From a hundred times too small a rate the control finds the band; a fixed one stays idle."""
     seen = {}
