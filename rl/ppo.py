@@ -95,6 +95,10 @@ class PPOConfig:
             raise ValueError("steps, minibatches and epochs must be at least 1")
 
 
+LESSON = 0.1
+"""Weight of the divergence (nats) of parts without noise from their labels. At 1 the lesson's
+noise, not the rewards, decides where Adam steps."""
+
 STATISTICS = ("kl", "clip_fraction", "policy_loss", "value_loss", "bounds_loss")
 STATISTICS += ("explained_variance",)
 """What ``PPO.update`` reports."""
@@ -179,6 +183,9 @@ class PPO:
         """0 while only the critic learns."""
         self.noisy = torch.ones(action_size, device=self.device)
         """(U,) 1 where the action has noise and the policy gradient counts; 0 elsewhere."""
+        self.labels: Tensor | None = None
+        """(T, M, U) what the parts without noise are to be in the rollout's states; None: nothing.
+        To be set before the first update and filled in place: graphs read it."""
         cuda = self.device.type == "cuda"
         self.bf16 = cuda if bf16 is None else bf16
         self.obs_dtype = torch.bfloat16 if cuda and self.bf16 else torch.float32
@@ -327,9 +334,11 @@ class PPO:
             # Averages over a minibatch of these weights are averages over its valid samples.
             "weight": valid * (total / count),
         }
+        if self.labels is not None:
+            batch["label"] = self.labels
         for name, x in batch.items():
             flat = x.flatten(0, 1)
-            if name in ("obs", "action", "mean", "log_prob"):
+            if name in ("obs", "action", "mean", "log_prob", "label"):
                 self._batch[name] = flat  # views of the rollout: the addresses stay
             elif name in self._batch:
                 self._batch[name].copy_(flat)
@@ -355,6 +364,9 @@ class PPO:
         error = clipped_value_error(value, b["target"], b["value"], c.value_clip)
         value_loss = (weight * error).mean()
         actor_loss = policy_loss + c.bounds_coefficient * bounds_loss
+        if self.labels is not None:
+            taught = gaussian_divergence(mean, b["label"], self.sigma, 1.0 - self.noisy)
+            actor_loss = actor_loss + LESSON * (weight * taught).mean()
         (self.actor_weight * actor_loss + c.critic_coefficient * value_loss).backward()
         with torch.no_grad():
             divergence = gaussian_divergence(mean, b["mean"], self.sigma, self.noisy)

@@ -165,7 +165,8 @@ def test_a_run_stopped_while_it_clones_goes_on_bit_for_bit(tmp_path: Path):
 
 
 def test_fingers_go_on_learning_their_labels_while_other_joints_stay(env, clip):
-    """After the cloning: the rest of the body is where the actor has it, nobody plays the clip."""
+    """After the cloning, without rewards: fingers come nearer to the clip, no other output is
+    pulled to it, and nobody plays the clip."""
     agent = PPO(env.obs_size, env.action_size, SMALL, "cpu", 0)
     learner = Cloning(env, agent, clip, 0, fingers=True)
     learner.leading = False
@@ -173,11 +174,8 @@ def test_fingers_go_on_learning_their_labels_while_other_joints_stay(env, clip):
     obs, names = env.reset(), env.physics.scene.body.dofs
     for _ in range(2):
         obs = collect(env, learner, rollout, obs, 0.99)
-        labels = torch.stack(learner._labels)
         agent.obs_norm.commit()
-        if _ == 0:
-            learner._labels.clear()
-    played = reference(clip, env)
+    labels, played = agent.labels.clone(), reference(clip, env)
     # The first step of the second rollout is number 6 of the episode (nobody has lost it yet).
     assert torch.equal(labels[0], played[6].expand(4, -1))
     fingers = [i for i, dof in enumerate(names) if dof.link[2:].startswith(FINGERS)]
@@ -194,15 +192,21 @@ def test_fingers_go_on_learning_their_labels_while_other_joints_stay(env, clip):
         with torch.no_grad():
             return float((agent.actor(rollout.obs) - target)[..., joints].square().mean().sqrt())
 
-    with torch.no_grad():
-        before = agent.actor(rollout.obs).clone()
-    first = error(fingers, labels)
+    before, head = rollout.mean.clone(), agent.actor.head.weight.detach().clone()
+    first, apart = error(fingers, labels), error(others, labels)
+    told = float(learner.update(rollout, 0)["clone_error"])
+    assert told == pytest.approx(float((before - labels)[..., fingers].square().mean().sqrt()))
+    assert torch.equal(head, agent.actor.head.weight)  # it is PPO that learns them
+    rollout.reward.zero_()
+    agent.learning_rate.fill_(1e-3)
     for _ in range(20):
-        learner._labels[:] = list(labels)
-        learner.update(rollout, 0)
-    moved = float((before - labels)[..., others].square().mean().sqrt())
+        # Nothing to gain: what is left of the policy's loss is the lesson.
+        agent._compute_advantages = lambda r: (r.advantages.zero_(), r.returns.zero_())[0]
+        agent.update(rollout)
+        agent.learning_rate.fill_(1e-3)
     assert error(fingers, labels) < 0.7 * first
-    assert error(others, before) < 0.2 * moved
+    assert (agent.actor.head.weight - head)[others].abs().max() == 0.0
+    assert error(others, before) < 0.2 * apart
     assert (rollout.mean - labels).abs().max() > 0.1  # the mean, not the label, is what PPO sees
 
 
