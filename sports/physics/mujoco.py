@@ -30,8 +30,10 @@ class MujocoPhysics:
         threads: int = 0,
         variation: Variation | None = None,
         variation_seed: int = 0,
+        felt_damping: bool = False,
     ) -> None:
-        """``threads``: 0 for all cores. ``variation``: let the worlds differ."""
+        """``threads``: 0 for all cores. ``variation``: let the worlds differ. ``felt_damping``: let
+        contacts feel the joints' damping (``sports.physics.variation``)."""
         self.scene = scene
         self.num_worlds = n = num_worlds
         self.threads = threads = threads or os.cpu_count() or 1
@@ -43,7 +45,7 @@ class MujocoPhysics:
         if variation is not None:
             drawn = draw(variation, n, scene.substeps, variation_seed)
         self._out = out = Results(scene, n)
-        self._worlds = Worlds(scene, model, self._trees, threads, out, drawn)
+        self._worlds = Worlds(scene, model, self._trees, threads, out, drawn, felt_damping)
         shown = Shown(scene, self.geometry, out)
         self.qpos, self.qvel, self.mocap_pos = shown.qpos, shown.qvel, shown.mocap_pos
         self.body_pos, self.body_quat, self.body_rot = (

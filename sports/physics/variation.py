@@ -3,12 +3,20 @@
 Violent motion on the ground depends on the time step of every engine: a policy trained on one
 world alone won 91 % of its long jumps at 1/120 s and none at 1/240 s or in Drake (measured, on
 MuJoCo's default ground). In training each world may have its own friction, gains, contact softness,
-damping and impedance, and time step.
+damping and impedance, and time step, and contacts that feel the joints' damping or do not.
+
+MuJoCo's integrator takes the damping of the joints implicitly, its contact solver does not know of
+it: a joint of 80 N m s/rad that carries a foot of 0.7 kg forgets its motion in 0.3 ms, and the
+solver, which looks 8 ms ahead, pushes at a foot that it believes to be free. That is most of what
+depends on the time step at strength ``paper`` (docs/physics.md, "What Drake feels and MuJoCo does
+not"). Where contacts feel the damping D, the solver works with M + h D, which is also what the
+implicit step divides by, so that the motion without contact is the same.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,14 +49,18 @@ class Variation:
     """Share of worlds that take several substeps in one: 2, 4, ... as often as leaves them
     ``LEAST_SUBSTEPS``. With ``timestep_divisor=4`` these run at the usual time step or at half of
     it, and the others at a quarter."""
+    felt_share: float = 0.5
+    """Share of worlds whose contacts feel the joints' damping, as Drake's do."""
 
     def __post_init__(self) -> None:
         for name in _RANGES:
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
                 raise ValueError(f"variation: {name} must be 0 < low <= high, not {low}, {high}")
-        if not 0.0 <= self.coarse_share <= 1.0:
-            raise ValueError(f"variation: coarse_share must be in [0, 1], not {self.coarse_share}")
+        for name in ("coarse_share", "felt_share"):
+            share = getattr(self, name)
+            if not 0.0 <= share <= 1.0:
+                raise ValueError(f"variation: {name} must be in [0, 1], not {share}")
 
 
 @dataclass(frozen=True)
@@ -63,6 +75,8 @@ class Draw:
     contact_impedance: np.ndarray
     stride: np.ndarray
     """int, substeps taken in one"""
+    felt: np.ndarray
+    """bool, whether contacts feel the joints' damping"""
 
     def timesteps(self, timestep: float, substeps: int) -> list[np.ndarray] | None:
         """(N,) time step of every substep: ``stride`` substeps in one, then none until the next;
@@ -83,7 +97,33 @@ def draw(variation: Variation, num_worlds: int, substeps: int, seed: int) -> Dra
     coarse = rng.random(num_worlds) < variation.coarse_share
     strides = [s for s in (2, 4, 8) if substeps % s == 0 and substeps // s >= LEAST_SUBSTEPS]
     drawn = np.array(strides or [1])[rng.integers(len(strides or [1]), size=num_worlds)]
-    return Draw(*values, stride=np.where(coarse, drawn, 1))
+    felt = rng.random(num_worlds) < variation.felt_share
+    return Draw(*values, stride=np.where(coarse, drawn, 1), felt=felt)
+
+
+class Damping(NamedTuple):
+    """Where the damping of the joints goes in each world; all (N, nv), N m s/rad and kg m^2."""
+
+    own: np.ndarray
+    """For the engine's implicit step, of which its contact solver knows nothing."""
+    force: np.ndarray
+    """Applied as a force -damping x rate at the beginning of every substep ..."""
+    armature: np.ndarray
+    """... with this added to the inertia, which makes that step the implicit one."""
+
+
+def split_damping(
+    damping: np.ndarray, joints: np.ndarray, felt: np.ndarray, timestep: np.ndarray
+) -> Damping:
+    """Lets contacts feel the ``damping`` (N, nv) of ``joints`` (nv,) bool in the worlds ``felt``
+    (N,) bool with time steps (N,) (s).
+
+    An implicit step of v' = (f - D v) / M is (M + h D) (v[k+1] - v[k]) = h (f - D v[k]): an explicit
+    one with the inertia M + h D, which the contact solver then sees.
+    """
+    moved = felt[:, None] & joints
+    force = np.where(moved, damping, 0.0)
+    return Damping(damping - force, force, timestep[:, None] * force)
 
 
 def contact_softness(
