@@ -118,8 +118,8 @@ def split_damping(
     """Lets contacts feel the ``damping`` (N, nv) of ``joints`` (nv,) bool in the worlds ``felt``
     (N,) bool with time steps (N,) (s).
 
-    An implicit step of v' = (f - D v) / M is (M + h D) (v[k+1] - v[k]) = h (f - D v[k]): an explicit
-    one with the inertia M + h D, which the contact solver then sees.
+    An implicit step of v' = (f - D v) / M is (M + h D) (v[k+1] - v[k]) = h (f - D v[k]): an
+    explicit one with the inertia M + h D, which the contact solver then sees.
     """
     moved = felt[:, None] & joints
     force = np.where(moved, damping, 0.0)

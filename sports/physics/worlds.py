@@ -67,8 +67,8 @@ class Worlds:
         drawn: Draw | None = None,
         felt_damping: bool = False,
     ) -> None:
-        """``model`` of ``mjcf``; ``drawn``: what makes the worlds differ; ``felt_damping``: contacts
-        feel the joints' damping in all of them."""
+        """``model`` of ``mjcf``; ``drawn``: what makes the worlds differ; ``felt_damping``:
+        contacts feel the joints' damping in all of them."""
         self.scene, self._trees, self._out = scene, trees, out
         n, body = out.num_worlds, scene.body
         self.batch = batch = Batch(model, nsim=n, nthread=threads)
