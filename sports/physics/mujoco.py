@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sports.humanoid.mjcf import build_model
+from sports.humanoid.mjcf import build_model, firm_ground
 from sports.physics.athletes import tree_of
 from sports.physics.base import PhysicsState, default_state
 from sports.physics.results import Results, Shown, show
@@ -33,7 +33,7 @@ class MujocoPhysics:
         felt_damping: bool = False,
     ) -> None:
         """``threads``: 0 for all cores. ``variation``: let the worlds differ. ``felt_damping``: let
-        contacts feel the joints' damping (``sports.physics.variation``)."""
+        contacts feel the joints' damping, on firm ground (``sports.physics.variation``)."""
         self.scene = scene
         self.num_worlds = n = num_worlds
         self.threads = threads = threads or os.cpu_count() or 1
@@ -44,6 +44,8 @@ class MujocoPhysics:
         drawn = None
         if variation is not None:
             drawn = draw(variation, n, scene.substeps, variation_seed)
+        elif felt_damping:
+            firm_ground(model)
         self._out = out = Results(scene, n)
         self._worlds = Worlds(scene, model, self._trees, threads, out, drawn, felt_damping)
         shown = Shown(scene, self.geometry, out)

@@ -20,10 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sports.humanoid.mjcf import CONTACT_SOLREF, is_bounce
+from sports.humanoid.mjcf import is_bounce, yields
 
 _RANGES = ("friction", "stiffness", "damping", "contact_time", "contact_damping")
 _RANGES += ("contact_impedance",)
+_FELT = ("contact_time", "contact_damping", "contact_impedance")
 LEAST_SUBSTEPS = 4
 """In a control step, of the coarsest worlds: the usual number."""
 
@@ -50,10 +51,14 @@ class Variation:
     ``LEAST_SUBSTEPS``. With ``timestep_divisor=4`` these run at the usual time step or at half of
     it, and the others at a quarter."""
     felt_share: float = 0.5
-    """Share of worlds whose contacts feel the joints' damping, as Drake's do."""
+    """Share of worlds whose contacts feel the joints' damping, as Drake's do. The ground that they
+    need is firmer; its ranges are:"""
+    felt_contact_time: tuple[float, float] = (0.01, 0.03)
+    felt_contact_damping: tuple[float, float] = (0.7, 1.3)
+    felt_contact_impedance: tuple[float, float] = (0.85, 0.98)
 
     def __post_init__(self) -> None:
-        for name in _RANGES:
+        for name in (*_RANGES, *(f"felt_{name}" for name in _FELT)):
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
                 raise ValueError(f"variation: {name} must be 0 < low <= high, not {low}, {high}")
@@ -93,12 +98,15 @@ def draw(variation: Variation, num_worlds: int, substeps: int, seed: int) -> Dra
     def uniform(span: tuple[float, float]) -> np.ndarray:
         return rng.uniform(*span, size=num_worlds)
 
-    values = [uniform(getattr(variation, name)) for name in _RANGES]
+    values = {name: uniform(getattr(variation, name)) for name in _RANGES}
     coarse = rng.random(num_worlds) < variation.coarse_share
     strides = [s for s in (2, 4, 8) if substeps % s == 0 and substeps // s >= LEAST_SUBSTEPS]
     drawn = np.array(strides or [1])[rng.integers(len(strides or [1]), size=num_worlds)]
     felt = rng.random(num_worlds) < variation.felt_share
-    return Draw(*values, stride=np.where(coarse, drawn, 1), felt=felt)
+    for name in _FELT:
+        own = uniform(getattr(variation, f"felt_{name}"))
+        values[name] = np.where(felt, own, values[name])
+    return Draw(**values, stride=np.where(coarse, drawn, 1), felt=felt)
 
 
 class Damping(NamedTuple):
@@ -132,10 +140,10 @@ def contact_softness(
     """(N, geoms, 2) ``solref`` and (N, geoms, 5) ``solimp`` of every world: as drawn for athletes
     and ground, else the model's (geoms, 2) and (geoms, 5). A ball bounces in one time step, however
     long that of its world is."""
-    yields = np.all(np.isclose(solref, CONTACT_SOLREF), axis=-1)[None, :, None]
+    ground = yields(solref)[None, :, None]
     softness = np.stack((drawn.contact_time, drawn.contact_damping), axis=-1)[:, None]
     impedance = np.repeat(solimp[None], len(drawn.contact_impedance), axis=0)
     impedance[..., :2] = drawn.contact_impedance[:, None, None]
     own = np.repeat(solref[None], len(drawn.stride), axis=0)
     own[..., 1] /= np.where(is_bounce(solref), drawn.stride[:, None], 1)
-    return np.where(yields, softness, own), np.where(yields, impedance, solimp[None])
+    return np.where(ground, softness, own), np.where(ground, impedance, solimp[None])

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from sports.ball_law.compiled import for_gpu
 from sports.humanoid.body import is_finger
-from sports.humanoid.mjcf import body_name, build_model
+from sports.humanoid.mjcf import body_name, build_model, firm_ground
 from sports.physics import warp_kernels as kernels
 from sports.physics.base import Geometry, PhysicsState, diverged
 from sports.physics.game import build_game, has_game
@@ -56,7 +56,7 @@ class WarpPhysics:
         felt_damping: bool = False,
     ) -> None:
         """``device``: a torch device; None takes the current GPU. ``variation``: let the worlds
-        differ. ``felt_damping``: let contacts feel the joints' damping
+        differ. ``felt_damping``: let contacts feel the joints' damping, on firm ground
         (``sports.physics.variation``). Raises RuntimeError when there is no GPU and ``device`` does
         not say ``cpu``."""
         if device is None:
@@ -74,6 +74,8 @@ class WarpPhysics:
         self.model = model = build_model(scene, sensors=False)
         # Warp never resets a diverged world by itself, and does not know the flag that says so.
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        if felt_damping and variation is None:
+            firm_ground(model)
         holds = any(o.holdable for o in scene.objects)
         model.opt.iterations = iterations or (HOLD_ITERATIONS if holds else ITERATIONS)
         model.opt.ls_iterations = line_search or (HOLD_LINE_SEARCH if holds else LINE_SEARCH)

@@ -11,12 +11,21 @@ from torch import Tensor
 
 import sports.physics.mujoco as engine
 from sports.env import make_scene
-from sports.humanoid.mjcf import build_model
+from sports.humanoid.mjcf import build_model, firm_ground
 from sports.physics import Physics, PhysicsState, default_state, make_physics
 from sports.physics.variation import Variation, draw, split_damping
 
 FINEST = 32
 """The reference is at 1/3840 s, finer than any joint forgets its motion."""
+OURS = {"contact_time": 1 / 60, "contact_damping": 0.7, "contact_impedance": 0.6}
+
+
+def neutral(felt_share: float, coarse_share: float = 0.0) -> Variation:
+    """Worlds with the numbers of the model that yields, all of them, felt or not."""
+    ground = {f"{prefix}{name}": (x, x) for name, x in OURS.items() for prefix in ("", "felt_")}
+    one = (1.0, 1.0)
+    shares = {"felt_share": felt_share, "coarse_share": coarse_share}
+    return Variation(one, one, one, **ground, **shares)
 
 
 def runners(worlds: int, height: float) -> tuple[PhysicsState, Tensor]:
@@ -57,6 +66,7 @@ def test_it_is_the_explicit_step_with_the_damping_in_the_inertia(monkeypatch):
 
     def heavier(scene):
         model = build_model(scene)
+        firm_ground(model)
         model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
         model.dof_armature[:] += model.opt.timestep * model.dof_damping
@@ -86,7 +96,8 @@ def test_what_the_ground_gives_depends_less_on_the_time_step(capsys):
     reference = played(of_mujoco(n, FINEST), state, targets)[1]
 
     def error(divisor: int, felt: bool) -> float:
-        velocity = played(of_mujoco(n, divisor, felt_damping=felt), state, targets)[1]
+        physics = of_mujoco(n, divisor, variation=neutral(float(felt)))
+        velocity = played(physics, state, targets)[1]
         return float((velocity - reference).square().sum(-1).mean().sqrt())
 
     plain, quarter, felt = error(1, False), error(4, False), error(1, True)
@@ -120,22 +131,16 @@ def test_split_is_the_implicit_step():
 @pytest.mark.parametrize("divisor", [1, 2])
 def test_worlds_that_vary_feel_it_or_do_not(divisor):
     """Neutral worlds of both kinds, and of both time steps, are the plain and the felt world."""
-    n = 24
-    neutral = Variation(
-        *[(1.0, 1.0)] * 3,
-        contact_time=(1 / 60, 1 / 60),
-        contact_damping=(0.7, 0.7),
-        contact_impedance=(0.6, 0.6),
-    )
+    n, mixed = 24, neutral(0.5, coarse_share=0.5)
     scene = make_scene("long_jump", timestep_divisor=divisor)
-    drawn = draw(neutral, n, scene.substeps, 1)
+    drawn = draw(mixed, n, scene.substeps, 1)
     kinds = {(int(s), bool(f)) for s, f in zip(drawn.stride, drawn.felt)}
     assert len(kinds) == 2 * divisor
     state, targets = runners(n, 0.02)
-    varied = played(of_mujoco(n, divisor, variation=neutral, variation_seed=1), state, targets)[1]
+    varied = played(of_mujoco(n, divisor, variation=mixed, variation_seed=1), state, targets)[1]
     for stride, felt in kinds:
         own = torch.tensor((drawn.stride == stride) & (drawn.felt == felt))
-        alone = of_mujoco(n, divisor // stride, felt_damping=felt)
+        alone = of_mujoco(n, divisor // stride, variation=neutral(float(felt)))
         off = (varied - played(alone, state, targets)[1])[own].abs().max()
         # The momentum of a coarse world is corrected at another instant.
         assert off < (1e-5 if stride == 1 else 0.05), (stride, felt)
@@ -154,5 +159,7 @@ def test_both_mujocos_feel_the_same():
 
 
 def test_a_share_is_between_none_and_all():
+    with pytest.raises(ValueError, match="felt_contact_time must be 0 < low <= high"):
+        Variation(felt_contact_time=(0.02, 0.01))
     with pytest.raises(ValueError, match=r"felt_share must be in \[0, 1\], not 1.5"):
         Variation(felt_share=1.5)
