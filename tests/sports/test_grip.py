@@ -78,6 +78,40 @@ def test_drake_holds_it_too(name, strength):
 
 
 @pytest.mark.parametrize("name", HOLDS)
+def test_hands_press_in_drake_as_in_mujoco(name):
+    """Forces on the object and how far the shapes overlap, contact by contact, after half a second.
+    With Drake's usual stiffness (6.7e4 N/m) the javelin was pressed with 14 N instead of 47."""
+    drake = pytest.importorskip("pydrake.multibody.tree")
+    found = list(contacts(*standing(name, seconds=0.5)))
+    pressed = sum(float(np.linalg.norm(force)) for _, force, _ in found)
+    overlap = sum(depth for _, _, depth in found)
+
+    hold = load_hold(name)
+    scene = hold.scene(load_body("smplx"), HELD[name])
+    physics = make_physics("drake", scene, 1)
+    physics.reset(torch.ones(1, dtype=torch.bool), default_state(scene, 1, "cpu"))
+    ctrl = torch.tensor(scene.action_offset(), dtype=torch.float32)[None]
+    for _ in range(15):
+        physics.step(ctrl)
+    plant = physics.plant
+    results = plant.get_contact_results_output_port().Eval(physics._contexts[0])
+    infos = [results.point_pair_contact_info(i) for i in range(results.num_point_pair_contacts())]
+    held = int(plant.GetBodyByName(HELD[name].name).index())
+    own = [i for i in infos if held in (int(i.bodyA_index()), int(i.bodyB_index()))]
+    links = {
+        plant.get_body(drake.BodyIndex(int(i.bodyA_index()) + int(i.bodyB_index()) - held)).name()
+        for i in own
+    }
+    there = sum(float(np.linalg.norm(i.contact_force())) for i in own)
+    depth = sum(i.point_pair().depth for i in own)
+    firm, firm_there = pressed / overlap, there / depth
+    print(f"{name}: {pressed:.1f} N, {firm:.2g} N/m; Drake {there:.1f} N, {firm_there:.2g} N/m")
+    assert there == pytest.approx(pressed, rel=0.2)
+    assert firm_there == pytest.approx(firm, rel=0.4)
+    assert {link for link, force, _ in found if force @ force > 9.0} <= links
+
+
+@pytest.mark.parametrize("name", HOLDS)
 def test_warp_holds_it_as_mujoco_does(name):
     pytest.importorskip("mujoco_warp")
     warp, c = (prove(load_hold(name), "paper", engine, 1.0) for engine in ("warp", "mujoco"))
