@@ -128,6 +128,11 @@ def yields(solref: np.ndarray) -> np.ndarray:
     return np.all(np.isclose(solref, CONTACT_SOLREF), axis=-1)
 
 
+def holds(solref: np.ndarray) -> np.ndarray:
+    """Which are those of athletes and what they can hold."""
+    return np.all(np.isclose(solref, HOLD_SOLREF), axis=-1)
+
+
 def firm_ground(model: mujoco.MjModel) -> None:
     """Makes contacts of athletes and ground firm, for an engine in which they feel the damping."""
     own = yields(model.geom_solref)

@@ -43,7 +43,7 @@ class MujocoPhysics:
         self.geometry = CompiledGeometry(scene.body, self.device)
         drawn = None
         if variation is not None:
-            drawn = draw(variation, n, scene.substeps, variation_seed)
+            drawn = draw(variation, n, scene.substeps, variation_seed, felt_damping)
         elif felt_damping:
             firm_ground(model)
         self._out = out = Results(scene, n)

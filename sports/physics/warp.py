@@ -100,8 +100,8 @@ class WarpPhysics:
             self._timesteps = [self.m.opt.timestep] * scene.substeps
             factor, felt, stride = np.ones(n), np.full(n, felt_damping), np.ones(n)
             if variation is not None:
-                drawn = draw(variation, n, scene.substeps, variation_seed)
-                factor, felt, stride = drawn.friction, felt | drawn.felt, drawn.stride
+                drawn = draw(variation, n, scene.substeps, variation_seed, felt_damping)
+                factor, felt, stride = drawn.friction, drawn.felt, drawn.stride
                 self._vary(drawn)
             self._felt: wp.array | None = None
             if felt.any():

@@ -100,7 +100,7 @@ class Worlds:
         felt, longest = np.full(n, felt_damping), self._even
         if drawn is not None:
             self._vary(drawn)
-            felt, longest = felt | drawn.felt, drawn.stride * scene.timestep
+            felt, longest = drawn.felt, drawn.stride * scene.timestep
         self._felt: np.ndarray | None = None
         if felt.any():
             self._feel(felt, longest)
