@@ -57,7 +57,7 @@ BOUNCE_TIMESTEP = 1.0 / 960.0
 HOLD_TIMESTEP = 1.0 / 1920.0
 """The same where hands hold something that does not bounce. A hand that throws presses with 100 N
 on contacts of 5e5 N/m; at a coarser step they hold on for too long: the shipped javelin thrower
-came to 0.8 m at 1/480 s, 1.4 m at 1/960 s and 2.6 m at 1/1920 s."""
+came to 0.8 m at 1/480 s, 1.4 m at 1/960 s and 2.0 m at 1/1920 s."""
 
 
 class DrakePhysics:
