@@ -171,7 +171,7 @@ class Tracking:
         """Memory after a reset."""
         frame = context["frame"]
         zero = torch.zeros_like(frame, dtype=torch.float32)
-        apart = self._apart(view, self.tables.at(frame))
+        apart = self.apart(view, self.tables.at(frame))
         action = torch.zeros(len(frame), self.tables.num_dofs, device=frame.device)
         return {
             "frame": frame.clone(),
@@ -184,7 +184,7 @@ class Tracking:
         }
 
     @staticmethod
-    def _apart(view: View, reference: Reference) -> Tensor:
+    def apart(view: View, reference: Reference) -> Tensor:
         """(N, B, 3) link positions minus the reference's."""
         return view.physics.body_pos[:, 0] - reference.pos
 
@@ -224,7 +224,7 @@ class Tracking:
             view.touching()[:, 0], self.tables.contact(frame)
         )
 
-        apart = self._apart(view, reference)
+        apart = self.apart(view, reference)
         distance = torch.linalg.vector_norm(apart, dim=-1)  # (N, B)
         local = torch.linalg.vector_norm(apart - apart[:, :1], dim=-1)
         before, earlier = memory["apart"].unbind(1)
@@ -339,6 +339,11 @@ class TrackingEnv(Env):
         """Says which clip each world plays after the next ``reset``."""
         first = self.tracking.tables.first
         self.tracking.assigned = first[torch.as_tensor(list(clips), device=first.device)]
+
+    def distance(self) -> Tensor:
+        """(N,) mean distance of the links from the reference's (m), now."""
+        apart = Tracking.apart(self.view, self.tracking.tables.at(self.memory["frame"]))
+        return torch.linalg.vector_norm(apart, dim=-1).mean(-1)
 
     def schedule(self, share: float) -> None:
         """Sets the curriculum for the part of the run that is done."""

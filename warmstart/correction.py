@@ -2,8 +2,9 @@
 
 A retargeted clip floats a little, slides a little and has no forces. Tracked in closed loop it
 becomes a motion of the simulated athlete, with PD targets that a policy could have played. The
-paper does this step with a learned tracker (PHC; Luo et al. 2023); here :mod:`warmstart.tracking`
-does it, which needs no training. What cannot be followed is cut short or rejected, with the reason.
+paper does this step with a learned tracker (PHC; Luo et al. 2023): ``player`` is one, see
+:mod:`rl.following`; without one :mod:`warmstart.tracking` does it, which needs no training. What
+cannot be followed is cut short or rejected, with the reason.
 """
 
 from __future__ import annotations
@@ -29,6 +30,11 @@ from warmstart.tracking import Tracking, track
 
 LIGHT = Tracking(worlds=96, horizon=12, iterations=2, noise=0.2)
 """Tracking with feed-forward needs half the rounds of the tracking of take-offs."""
+
+
+Player = Callable[[Clip, float], Clip]
+"""Plays a clip at the control rate until the mean distance of the links exceeds a length (m):
+returns what the athlete did, from the clip's first frame on, with PD targets."""
 
 
 @dataclass(frozen=True)
@@ -110,11 +116,13 @@ def correct(
     settings: Tracking = LIGHT,
     bounds: Bounds | None = None,
     *,
+    player: Player | None = None,
     threads: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Corrected:
     """Tracks a clip in MuJoCo on a flat floor and measures what came out.
 
+    ``player`` follows the clip (an athlete of ``strength``); None for ``settings``'s search.
     ``progress(step, steps)`` is called after every control step. The same clip and settings give
     the same motion. Raises ValueError for a clip shorter than two control steps, RuntimeError
     when the simulation diverges.
@@ -126,14 +134,13 @@ def correct(
     reference = replace(clip, meta={}).resample(1.0 / scene.control_timestep)
     if reference.num_frames < 3:
         raise ValueError(f"the clip is only {clip.duration:.3f} s long: there is nothing to track")
+    recorded = reference
     reference, forces = with_targets(reference, body)
-    found = track(
-        reference,
-        scene,
-        replace(settings, lost=bounds.lost),
-        threads=threads,
-        progress=progress,
-    ).clip
+    if player is not None:
+        found = player(recorded, bounds.lost)
+    else:
+        lost = replace(settings, lost=bounds.lost)
+        found = track(reference, scene, lost, threads=threads, progress=progress).clip
     chain = Chain(body)
     fell = found.num_frames < reference.num_frames
     end = found.num_frames
@@ -166,11 +173,12 @@ def correct(
         sunk=float((chain.heights(got)[:end].min(1) < -SUNK).mean()),
     )
     record = {k: round(v, 5) if isinstance(v, float) else v for k, v in asdict(measured).items()}
+    by = {"seed": settings.seed} if player is None else {"tracker": str(player)}
     meta = {
         **clip.meta,
         "strength": strength,
         "source": f"{clip.meta.get('source', 'clip')}, tracked in MuJoCo",
-        "corrected": {"engine": "mujoco", "seed": settings.seed, **record},
+        "corrected": {"engine": "mujoco", **by, **record},
     }
     return Corrected(
         clip=replace(kept, meta=meta),

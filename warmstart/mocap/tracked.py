@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from warmstart.clip import Clip, clip_files
-from warmstart.correction import LIGHT, Bounds, correct
+from warmstart.correction import LIGHT, Bounds, Player, correct
 from warmstart.mocap.record import read_record, write_record
 from warmstart.tracking import Tracking
 
@@ -31,6 +31,8 @@ class Options:
     seconds: float | None = None
     """At most so much of each clip; None for all of it."""
     keep_rejected: bool = False
+    player: str = ""
+    """What follows the clips, by name; empty for the search of ``settings``."""
     settings: Tracking = LIGHT
     bounds: Bounds = field(default_factory=Bounds)
 
@@ -61,11 +63,13 @@ def track_clips(
     options: Options | None = None,
     show: Callable[[list[Entry]], None] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    player: Player | None = None,
 ) -> list[Entry]:
     """Tracks the clips of a file or folder and writes those that are good, with ``track.json``.
 
     Clips that are recorded there and unchanged are not tracked again. ``show`` is called after each
-    file with all entries so far, ``progress(file, step, steps)`` within one. Raises ValueError for
+    file with all entries so far, ``progress(file, step, steps)`` within one; ``player`` is the one
+    that the options name. Raises ValueError for
     a source without clips, one of which none can be read (nothing is written then), or an ``out``
     that is a file or the source itself; OSError when writing fails.
     """
@@ -85,7 +89,7 @@ def track_clips(
             entries.append(old)
         else:
             report = None if progress is None else _named(progress, name)
-            entries.append(_one(path, name, digest, out, options, report))
+            entries.append(_one(path, name, digest, out, options, report, player))
         wrote = wrote or entries[-1].status != "unreadable"
         if wrote:
             write_record(out / RECORD, FORMAT, entries, before)
@@ -107,6 +111,7 @@ def _one(
     out: Path,
     options: Options,
     progress: Callable[[int, int], None] | None,
+    player: Player | None,
 ) -> Entry:
     entry = Entry(name, digest, "unreadable")
     try:
@@ -116,7 +121,8 @@ def _one(
             if options.start >= clip.duration:
                 raise ValueError(f"{path} ends before second {options.start:g}")
             clip = clip.cut(options.start, end)
-        done = correct(clip, options.strength, options.settings, options.bounds, progress=progress)
+        how = (options.strength, options.settings, options.bounds)
+        done = correct(clip, *how, player=player, progress=progress)
     except ValueError as error:
         text = str(error)
         entry.reasons = [text if str(path) in text else f"{path}: {text}"]
