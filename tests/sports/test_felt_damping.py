@@ -3,6 +3,8 @@ the time step, in the air, and in worlds that differ."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -22,10 +24,10 @@ OURS = {"contact_time": 1 / 60, "contact_damping": 0.7, "contact_impedance": 0.6
 
 def neutral(felt_share: float, coarse_share: float = 0.0) -> Variation:
     """Worlds with the numbers of the model that yields, all of them, felt or not."""
-    ground = {f"{prefix}{name}": (x, x) for name, x in OURS.items() for prefix in ("", "felt_")}
     one = (1.0, 1.0)
-    shares = {"felt_share": felt_share, "coarse_share": coarse_share}
-    return Variation(one, one, one, **ground, **shares)
+    ground = {f"{prefix}{name}": (x, x) for name, x in OURS.items() for prefix in ("", "felt_")}
+    plain = Variation(one, one, one, felt_share=felt_share, coarse_share=coarse_share)
+    return dataclasses.replace(plain, **ground)
 
 
 def runners(worlds: int, height: float) -> tuple[PhysicsState, Tensor]:
