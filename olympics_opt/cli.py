@@ -116,6 +116,9 @@ class Evaluate:
     """Strength of the athlete; by default the one the policy was trained with."""
     limits: Literal["paper", "anatomical"] | None = None
     """Joint ranges; by default those the policy was trained with."""
+    felt_damping: bool = False
+    """In ``mujoco`` and ``warp``, let contacts feel the joints' damping, as Drake's do: a quick
+    guess of what Drake will say. The result says so, and does not compare with the others."""
     likeness: Path | None = None
     """Print how human the motion looks beside the score: ``reference`` compares it with the shipped
     figures of people, a clip library with its held-out clips (``olympics-opt likeness``)."""

@@ -23,7 +23,8 @@ PAPER_COLUMNS = ("PPO", "AMP", "PULSE", "PULSE + AMP")
 def read_results(folder: str | Path) -> list[dict[str, Any]]:
     """Every result in a folder, sorted by task, strength, algorithm and engine.
 
-    Files of other kinds (a benchmark) are left out. Raises ValueError naming a file that is not
+    Files of other kinds (a benchmark) and results with felt damping, which is other physics, are
+    left out. Raises ValueError naming a file that is not
     JSON, or a result that lacks a field.
     """
     folder = Path(folder)
@@ -36,6 +37,8 @@ def read_results(folder: str | Path) -> list[dict[str, Any]]:
         except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
             raise ValueError(f"{path} is not a readable result file: {error}") from error
         if not isinstance(result, dict) or "task" not in result or "metrics" not in result:
+            continue
+        if result.get("felt_damping"):
             continue
         missing = [name for name in REQUIRED if name not in result]
         if missing:

@@ -94,6 +94,7 @@ def play(
     record: bool = False,
     record_worlds: tuple[int, ...] = (),
     label: str = "",
+    felt_damping: bool = False,
 ) -> EvaluationResult:
     """``rl.evaluate.evaluate`` with a line of progress; its errors and its result.
 
@@ -114,6 +115,7 @@ def play(
             limits=limits,
             options=options,
             timestep_divisor=timestep_divisor,
+            physics_options={"felt_damping": True} if felt_damping else None,
             record=int(record),
             record_worlds=record_worlds,
             processes=processes,
@@ -130,6 +132,10 @@ def play(
 def run_evaluate(config: Evaluate) -> int:
     """The command: prints the metrics and writes the result schema."""
     trials = asked(config)
+    if config.felt_damping and config.engine == "drake":
+        raise ValueError(
+            "contacts always feel the joints' damping in drake: leave out felt-damping"
+        )
     if config.trials >= 1:  # else the evaluation says what is wrong
         atomic.prepare(config.out)
     reference = None
@@ -138,7 +144,13 @@ def run_evaluate(config: Evaluate) -> int:
 
         reference = load_reference([config.likeness])
     worlds = tuple(range(SHOWN)) if reference is not None else ()
-    played = play(**trials, engine=config.engine, worlds=config.worlds, record_worlds=worlds)
+    played = play(
+        **trials,
+        engine=config.engine,
+        worlds=config.worlds,
+        record_worlds=worlds,
+        felt_damping=config.felt_damping,
+    )
     print_metrics(played.result)
     print_training_step(config)
     if reference is not None:

@@ -160,6 +160,8 @@ def default_env(config: TrainConfig, seed: int) -> Env:
     if config.engine == "mujoco" and local_ranks() > 1:
         each = max(1, (os.cpu_count() or 1) // local_ranks())
         physics_options = {"threads": each} | physics_options
+    if config.felt_damping:
+        physics_options |= {"felt_damping": True}
     if config.vary:
         physics_options |= {"variation": Variation(), "variation_seed": seed}
     if config.task == PRIOR:

@@ -65,7 +65,11 @@ class TrainConfig:
     vary: bool = False
     """Let the worlds differ in friction, gains and contact softness and, with a
     ``timestep_divisor`` of 2 or 4, in time step: half of them take longer ones, up to the full
-    step. A policy that must hold in every engine needs it."""
+    step. In half of them contacts feel the joints' damping. A policy that must hold in every engine
+    needs it."""
+    felt_damping: bool = False
+    """Contacts feel the joints' damping in all worlds, as in Drake (docs/physics.md). The policy is
+    then one for Drake, and may fail in evaluations on mujoco without it."""
     init: str | None = None
     """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]; also that of
     another task with the same body (tennis for tennis_1v1)."""

@@ -168,6 +168,8 @@ def evaluate(
     }
     if policy.prior is not None:
         result["prior_digest"] = policy.prior.digest
+    if (physics_options or {}).get("felt_damping"):
+        result["felt_damping"] = True
     for recording in recordings.values():
         recording.meta |= {"policy_sha256": card["sha256"], "commit": result["commit"]}
     return EvaluationResult(result, values, recordings)

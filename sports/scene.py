@@ -249,6 +249,13 @@ class Scene:
         n = 6 + self.body.num_dofs
         return slice(agent * n, (agent + 1) * n)
 
+    def joint_dofs(self) -> np.ndarray:
+        """(nv,) bool, which of ``qvel`` are rates of athletes' joints."""
+        joints = np.zeros(self.nv, dtype=bool)
+        for agent in range(self.num_agents):
+            joints[self.agent_qvel(agent)][6:] = True
+        return joints
+
     def object_qpos(self, name: str) -> slice:
         """Where a free object's position and quaternion lie in ``qpos``. Raises KeyError."""
         start = self.num_agents * (7 + self.body.num_dofs) + 7 * self._free_index(name)

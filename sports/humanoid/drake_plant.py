@@ -75,6 +75,11 @@ the mean (forward, up) and 0.08, 0.07, 0.08 rms at strength ``human``; see docs/
 10 s/m the force of an impact was 1.7 times MuJoCo's."""
 OBJECT_STIFFNESS, OBJECT_DISSIPATION = 1e5, 1.0
 """Of bars, uprights and other objects: a pushed bar leaves its groove as in MuJoCo."""
+HOLD_STIFFNESS = 1e6
+"""Of hands with fingers and of what they can hold (N/m), half of it for both together. In the
+holds, MuJoCo's contacts have 4e5 N/m at the fingers and 6.6e5 at the palm (force by depth). With
+the stiffnesses above it was 6.7e4: fingers sank in by a tenth of a millimetre more, and since they
+are held by stiff servos the javelin was pressed with 14 N instead of 47."""
 
 _UNIT = np.eye(3)
 
@@ -290,6 +295,7 @@ def add_humanoid(plant: MultibodyPlant, body: Body, name: str = "athlete") -> Dr
         if plant.time_step() > 0:
             actuator.set_controller_gains(PdControllerGains(p=dof.kp, d=0.0))
         actuators.append(actuator)
+    grasping = hands(body)
     geometry = [
         add_shapes(
             plant,
@@ -298,6 +304,7 @@ def add_humanoid(plant: MultibodyPlant, body: Body, name: str = "athlete") -> Dr
             link.shapes,
             contact_properties(),
             ground=not is_finger(link.name),
+            firm=contact_properties(stiffness=HOLD_STIFFNESS) if link.name in grasping else None,
         )
         for link in body.links
     ]
@@ -312,6 +319,12 @@ def add_humanoid(plant: MultibodyPlant, body: Body, name: str = "athlete") -> Dr
     )
 
 
+def hands(body: Body) -> frozenset[str]:
+    """Links of hands that can hold something: fingers, and what the first of them hang on."""
+    fingers = [link for link in body.links if is_finger(link.name)]
+    return frozenset(name for link in fingers for name in (link.name, link.parent) if name)
+
+
 def _offset_frame(name: str, parent: RigidBody, offset: Sequence[float]) -> FixedOffsetFrame:
     return FixedOffsetFrame(name, parent.body_frame(), RigidTransform(np.asarray(offset)))
 
@@ -323,10 +336,12 @@ def add_shapes(
     shapes: Iterable[Shape],
     properties: ProximityProperties,
     ground: bool = True,
+    firm: ProximityProperties | None = None,
 ) -> tuple[tuple[GeometryId, ...], tuple[GeometryId, ...]]:
     """Register shapes on a body: (points for the ground, none if not ``ground``; true shapes).
 
-    Nothing is registered, and both are empty, when the plant has no SceneGraph.
+    ``firm``: properties of the true shapes, if not those of the points. Nothing is registered, and
+    both are empty, when the plant has no SceneGraph.
     """
     if not plant.geometry_source_is_registered():
         return (), ()
@@ -335,7 +350,9 @@ def add_shapes(
     for i, shape in enumerate(shapes):
         X_LS, geometry = drake_shape(shape)
         solids.append(
-            plant.RegisterCollisionGeometry(rigid, X_LS, geometry, f"{name}_shape{i}", properties)
+            plant.RegisterCollisionGeometry(
+                rigid, X_LS, geometry, f"{name}_shape{i}", firm or properties
+            )
         )
         for k, (p_LoS_L, radius) in enumerate(support_points(shape) if ground else ()):
             points.append(

@@ -44,6 +44,8 @@ CONTACT_IMPEDANCE = 0.6
 """Share of a contact's acceleration that is prescribed; the rest yields to the load."""
 CONTACT_SOLIMP = (CONTACT_IMPEDANCE, CONTACT_IMPEDANCE, 0.001, 0.5, 2.0)
 """The impedance in MuJoCo's terms: the same at any depth."""
+FIRM_SOLREF, FIRM_SOLIMP = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)
+"""The same contacts where they feel the joints' damping: MuJoCo's defaults."""
 HOLD_SOLREF, HOLD_IMPEDANCE = (1.0 / 120.0, 1.0), 0.99
 """Contacts of athletes with what they can hold: the least time constant at 1/240 s, critical
 damping, and so little yielding that a held javelin creeps by 0.2 mm/s."""
@@ -119,6 +121,22 @@ def _add_agent(spec: mujoco.MjSpec, scene: Scene, agent: int) -> None:
         actuator.biasprm[:3] = (0.0, -dof.kp, 0.0)
     for a, b in body.excluded_pairs:
         spec.add_exclude(bodyname1=body_name(agent, a), bodyname2=body_name(agent, b))
+
+
+def yields(solref: np.ndarray) -> np.ndarray:
+    """Which contact references (..., 2) of a compiled model are those of athletes and ground."""
+    return np.all(np.isclose(solref, CONTACT_SOLREF), axis=-1)
+
+
+def holds(solref: np.ndarray) -> np.ndarray:
+    """Which are those of athletes and what they can hold."""
+    return np.all(np.isclose(solref, HOLD_SOLREF), axis=-1)
+
+
+def firm_ground(model: mujoco.MjModel) -> None:
+    """Makes contacts of athletes and ground firm, for an engine in which they feel the damping."""
+    own = yields(model.geom_solref)
+    model.geom_solref[own], model.geom_solimp[own] = FIRM_SOLREF, FIRM_SOLIMP
 
 
 def is_bounce(solref: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, QuaternionFloatingJoint, RigidBody
 
 from sports.humanoid.drake_plant import (
+    HOLD_STIFFNESS,
     OBJECT_DISSIPATION,
     OBJECT_STIFFNESS,
     DrakeHumanoid,
@@ -82,6 +83,9 @@ def add_object(
             obj.shapes,
             contact_properties(obj.friction, OBJECT_STIFFNESS, dissipation),
             ground=obj.motion == "free" and obj.meets_ground,
+            firm=contact_properties(obj.friction, HOLD_STIFFNESS, dissipation)
+            if obj.holdable
+            else None,
         )
     points.extend(own[0])
     shapes.extend(own[1])
@@ -98,7 +102,7 @@ def _add_ball(
     frequency = -math.log(ball.restitution) / (BOUNCE_LOSS * timestep)
     stiffness = sphere.mass * frequency**2
     X_BS, geometry = drake_shape(sphere)
-    soft, firm = (stiffness, 0.0), (OBJECT_STIFFNESS, OBJECT_DISSIPATION)
+    soft, firm = (stiffness, 0.0), (HOLD_STIFFNESS, OBJECT_DISSIPATION)
     surfaces = [("ground", ball.friction, soft), ("rest", ball.grip, soft)]
     if ball.holdable:
         surfaces[1:] = [("rest", 0.0, soft), (_HELD, ball.grip, firm)]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sports.humanoid.mjcf import build_model
+from sports.humanoid.mjcf import build_model, firm_ground
 from sports.physics.athletes import tree_of
 from sports.physics.base import PhysicsState, default_state
 from sports.physics.results import Results, Shown, show
@@ -30,8 +30,10 @@ class MujocoPhysics:
         threads: int = 0,
         variation: Variation | None = None,
         variation_seed: int = 0,
+        felt_damping: bool = False,
     ) -> None:
-        """``threads``: 0 for all cores. ``variation``: let the worlds differ."""
+        """``threads``: 0 for all cores. ``variation``: let the worlds differ. ``felt_damping``: let
+        contacts feel the joints' damping, on firm ground (``sports.physics.variation``)."""
         self.scene = scene
         self.num_worlds = n = num_worlds
         self.threads = threads = threads or os.cpu_count() or 1
@@ -41,9 +43,11 @@ class MujocoPhysics:
         self.geometry = CompiledGeometry(scene.body, self.device)
         drawn = None
         if variation is not None:
-            drawn = draw(variation, n, scene.substeps, variation_seed)
+            drawn = draw(variation, n, scene.substeps, variation_seed, felt_damping)
+        elif felt_damping:
+            firm_ground(model)
         self._out = out = Results(scene, n)
-        self._worlds = Worlds(scene, model, self._trees, threads, out, drawn)
+        self._worlds = Worlds(scene, model, self._trees, threads, out, drawn, felt_damping)
         shown = Shown(scene, self.geometry, out)
         self.qpos, self.qvel, self.mocap_pos = shown.qpos, shown.qvel, shown.mocap_pos
         self.body_pos, self.body_quat, self.body_rot = (

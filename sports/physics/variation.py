@@ -3,19 +3,28 @@
 Violent motion on the ground depends on the time step of every engine: a policy trained on one
 world alone won 91 % of its long jumps at 1/120 s and none at 1/240 s or in Drake (measured, on
 MuJoCo's default ground). In training each world may have its own friction, gains, contact softness,
-damping and impedance, and time step.
+damping and impedance, and time step, and contacts that feel the joints' damping or do not.
+
+MuJoCo's integrator takes the damping of the joints implicitly, its contact solver does not know of
+it: a joint of 80 N m s/rad that carries a foot of 0.7 kg forgets its motion in 0.3 ms, and the
+solver, which looks 8 ms ahead, pushes at a foot that it believes to be free. That is most of what
+depends on the time step at strength ``paper`` (docs/physics.md, "What Drake feels and MuJoCo does
+not"). Where contacts feel the damping D, the solver works with M + h D, which is also what the
+implicit step divides by, so that the motion without contact is the same.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from sports.humanoid.mjcf import CONTACT_SOLREF, is_bounce
+from sports.humanoid.mjcf import holds, is_bounce, yields
 
 _RANGES = ("friction", "stiffness", "damping", "contact_time", "contact_damping")
 _RANGES += ("contact_impedance",)
+_FELT = ("contact_time", "contact_damping", "contact_impedance")
 LEAST_SUBSTEPS = 4
 """In a control step, of the coarsest worlds: the usual number."""
 
@@ -41,14 +50,26 @@ class Variation:
     """Share of worlds that take several substeps in one: 2, 4, ... as often as leaves them
     ``LEAST_SUBSTEPS``. With ``timestep_divisor=4`` these run at the usual time step or at half of
     it, and the others at a quarter."""
+    felt_share: float = 0.5
+    """Share of worlds whose contacts feel the joints' damping, as Drake's do. The ground that they
+    need is firmer; its ranges are:"""
+    felt_contact_time: tuple[float, float] = (0.01, 0.03)
+    felt_contact_damping: tuple[float, float] = (0.7, 1.3)
+    felt_contact_impedance: tuple[float, float] = (0.85, 0.98)
+    hold_time: tuple[float, float] = (0.002, 0.0125)
+    """Time constant of the contacts of athletes with what they can hold (s). Under the 100 N of a
+    finger that throws a ball sinks in by 8 mm at the model's 1/120 s, by less at 2 ms and in
+    Drake."""
 
     def __post_init__(self) -> None:
-        for name in _RANGES:
+        for name in (*_RANGES, *(f"felt_{name}" for name in _FELT), "hold_time"):
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
                 raise ValueError(f"variation: {name} must be 0 < low <= high, not {low}, {high}")
-        if not 0.0 <= self.coarse_share <= 1.0:
-            raise ValueError(f"variation: coarse_share must be in [0, 1], not {self.coarse_share}")
+        for name in ("coarse_share", "felt_share"):
+            share = getattr(self, name)
+            if not 0.0 <= share <= 1.0:
+                raise ValueError(f"variation: {name} must be in [0, 1], not {share}")
 
 
 @dataclass(frozen=True)
@@ -63,6 +84,9 @@ class Draw:
     contact_impedance: np.ndarray
     stride: np.ndarray
     """int, substeps taken in one"""
+    felt: np.ndarray
+    """bool, whether contacts feel the joints' damping"""
+    hold_time: np.ndarray
 
     def timesteps(self, timestep: float, substeps: int) -> list[np.ndarray] | None:
         """(N,) time step of every substep: ``stride`` substeps in one, then none until the next;
@@ -72,30 +96,64 @@ class Draw:
         return [np.where(i % self.stride == 0, self.stride * timestep, 0) for i in range(substeps)]
 
 
-def draw(variation: Variation, num_worlds: int, substeps: int, seed: int) -> Draw:
-    """One draw for each world of a scene with so many substeps in a control step."""
+def draw(
+    variation: Variation, num_worlds: int, substeps: int, seed: int, all_felt: bool = False
+) -> Draw:
+    """One draw for each world of a scene with so many substeps in a control step. ``all_felt``:
+    with felt damping, whatever the share."""
     rng = np.random.default_rng(seed)
 
     def uniform(span: tuple[float, float]) -> np.ndarray:
         return rng.uniform(*span, size=num_worlds)
 
-    values = [uniform(getattr(variation, name)) for name in _RANGES]
+    values = {name: uniform(getattr(variation, name)) for name in _RANGES}
     coarse = rng.random(num_worlds) < variation.coarse_share
     strides = [s for s in (2, 4, 8) if substeps % s == 0 and substeps // s >= LEAST_SUBSTEPS]
     drawn = np.array(strides or [1])[rng.integers(len(strides or [1]), size=num_worlds)]
-    return Draw(*values, stride=np.where(coarse, drawn, 1))
+    felt = (rng.random(num_worlds) < variation.felt_share) | all_felt
+    for name in _FELT:
+        own = uniform(getattr(variation, f"felt_{name}"))
+        values[name] = np.where(felt, own, values[name])
+    values["hold_time"] = uniform(variation.hold_time)
+    return Draw(**values, stride=np.where(coarse, drawn, 1), felt=felt)
+
+
+class Damping(NamedTuple):
+    """Where the damping of the joints goes in each world; all (N, nv), N m s/rad and kg m^2."""
+
+    own: np.ndarray
+    """For the engine's implicit step, of which its contact solver knows nothing."""
+    force: np.ndarray
+    """Applied as a force -damping x rate at the beginning of every substep ..."""
+    armature: np.ndarray
+    """... with this added to the inertia, which makes that step the implicit one."""
+
+
+def split_damping(
+    damping: np.ndarray, joints: np.ndarray, felt: np.ndarray, timestep: np.ndarray
+) -> Damping:
+    """Lets contacts feel the ``damping`` (N, nv) of ``joints`` (nv,) bool in the worlds ``felt``
+    (N,) bool with time steps (N,) (s).
+
+    An implicit step of v' = (f - D v) / M is (M + h D) (v[k+1] - v[k]) = h (f - D v[k]): an
+    explicit one with the inertia M + h D, which the contact solver then sees.
+    """
+    moved = felt[:, None] & joints
+    force = np.where(moved, damping, 0.0)
+    return Damping(damping - force, force, timestep[:, None] * force)
 
 
 def contact_softness(
     solref: np.ndarray, solimp: np.ndarray, drawn: Draw
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N, geoms, 2) ``solref`` and (N, geoms, 5) ``solimp`` of every world: as drawn for athletes
-    and ground, else the model's (geoms, 2) and (geoms, 5). A ball bounces in one time step, however
-    long that of its world is."""
-    yields = np.all(np.isclose(solref, CONTACT_SOLREF), axis=-1)[None, :, None]
+    and ground, and for hands and what they hold; else the model's (geoms, 2) and (geoms, 5). A ball
+    bounces in one time step, however long that of its world is."""
+    ground = yields(solref)[None, :, None]
     softness = np.stack((drawn.contact_time, drawn.contact_damping), axis=-1)[:, None]
     impedance = np.repeat(solimp[None], len(drawn.contact_impedance), axis=0)
     impedance[..., :2] = drawn.contact_impedance[:, None, None]
     own = np.repeat(solref[None], len(drawn.stride), axis=0)
     own[..., 1] /= np.where(is_bounce(solref), drawn.stride[:, None], 1)
-    return np.where(yields, softness, own), np.where(yields, impedance, solimp[None])
+    own[..., 0] = np.where(holds(solref), drawn.hold_time[:, None], own[..., 0])
+    return np.where(ground, softness, own), np.where(ground, impedance, solimp[None])

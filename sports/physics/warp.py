@@ -17,11 +17,11 @@ from torch import Tensor
 
 from sports.ball_law.compiled import for_gpu
 from sports.humanoid.body import is_finger
-from sports.humanoid.mjcf import body_name, build_model
+from sports.humanoid.mjcf import body_name, build_model, firm_ground
 from sports.physics import warp_kernels as kernels
 from sports.physics.base import Geometry, PhysicsState, diverged
 from sports.physics.game import build_game, has_game
-from sports.physics.variation import Draw, Variation, contact_softness, draw
+from sports.physics.variation import Draw, Variation, contact_softness, draw, split_damping
 from sports.physics.warp_factor import faster, pieces
 from sports.scene import Scene
 
@@ -53,9 +53,12 @@ class WarpPhysics:
         line_search: int | None = None,
         variation: Variation | None = None,
         variation_seed: int = 0,
+        felt_damping: bool = False,
     ) -> None:
         """``device``: a torch device; None takes the current GPU. ``variation``: let the worlds
-        differ. Raises RuntimeError when there is no GPU and ``device`` does not say ``cpu``."""
+        differ. ``felt_damping``: let contacts feel the joints' damping, on firm ground
+        (``sports.physics.variation``). Raises RuntimeError when there is no GPU and ``device`` does
+        not say ``cpu``."""
         if device is None:
             if not torch.cuda.is_available():
                 raise RuntimeError(
@@ -71,6 +74,8 @@ class WarpPhysics:
         self.model = model = build_model(scene, sensors=False)
         # Warp never resets a diverged world by itself, and does not know the flag that says so.
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        if felt_damping and variation is None:
+            firm_ground(model)
         holds = any(o.holdable for o in scene.objects)
         model.opt.iterations = iterations or (HOLD_ITERATIONS if holds else ITERATIONS)
         model.opt.ls_iterations = line_search or (HOLD_LINE_SEARCH if holds else LINE_SEARCH)
@@ -93,11 +98,14 @@ class WarpPhysics:
             self.m.opt.warn_overflow = 0  # counted below, never printed
             self.d = mjw.make_data(model, nworld=n, nconmax=contacts, njmax=rows)
             self._timesteps = [self.m.opt.timestep] * scene.substeps
-            factor = np.ones(n)
+            factor, felt, stride = np.ones(n), np.full(n, felt_damping), np.ones(n)
             if variation is not None:
-                drawn = draw(variation, n, scene.substeps, variation_seed)
-                factor = drawn.friction
+                drawn = draw(variation, n, scene.substeps, variation_seed, felt_damping)
+                factor, felt, stride = drawn.friction, drawn.felt, drawn.stride
                 self._vary(drawn)
+            self._felt: wp.array | None = None
+            if felt.any():
+                self._feel(felt, stride * scene.timestep)
         view = wp.to_torch
         d = self.d
         self.qpos, self.qvel = view(d.qpos), view(d.qvel)
@@ -272,6 +280,16 @@ class WarpPhysics:
         if timesteps is not None:
             self._timesteps = [wp.array(h.astype(np.float32), dtype=float) for h in timesteps]
 
+    def _feel(self, felt: np.ndarray, timestep: np.ndarray) -> None:
+        """Lets contacts feel the joints' damping in some worlds (n,) with time steps (n,)."""
+        m, shape = self.m, (self.num_worlds, self.scene.nv)
+        damping = np.broadcast_to(m.dof_damping.numpy(), shape)
+        split = split_damping(damping, self.scene.joint_dofs(), felt, timestep)
+        armature = np.broadcast_to(m.dof_armature.numpy(), shape) + split.armature
+        m.dof_damping = wp.array(split.own.astype(np.float32), dtype=float)
+        m.dof_armature = wp.array(armature.astype(np.float32), dtype=float)
+        self._felt = wp.array(split.force.astype(np.float32), dtype=float)
+
     def _new_game(self) -> dict[str, Tensor]:
         """The ball and the drag as tensors; ``self._wp_game`` is what the kernels get of them."""
         wrench = wp.to_torch(self.d.xfrc_applied)
@@ -306,6 +324,9 @@ class WarpPhysics:
         for i in range(self.scene.substeps):
             self.m.opt.timestep = self._timesteps[i]
             self._ask_law("push_worlds", self._timesteps[i])
+            if self._felt is not None:
+                inputs = [self._felt, d.qvel]
+                wp.launch(kernels.damp, dim=d.qvel.shape, inputs=inputs, outputs=[d.qfrc_applied])
             with faster(self._pieces):
                 mjw.step(self.m, d)
             mjw.contact_force(self.m, d, self._contact_ids, True, self._contact_force)

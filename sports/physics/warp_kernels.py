@@ -67,6 +67,17 @@ def sum_contacts(
 
 
 @wp.kernel
+def damp(
+    damping: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    force: wp.array2d(dtype=float),  # type: ignore[valid-type]
+):
+    """The force against every rate (N, nv) by its damping."""
+    w, i = wp.tid()
+    force[w, i] = -damping[w, i] * qvel[w, i]
+
+
+@wp.kernel
 def roll(
     forces: wp.array3d(dtype=float),  # type: ignore[valid-type]
     slot: int,

@@ -18,7 +18,7 @@ from sports.physics.athletes import Tree, finish_athlete, look_at_contacts, roll
 from sports.physics.game import build_game, has_game
 from sports.physics.momentum import AthleteKeeper
 from sports.physics.results import Results, show, show_state
-from sports.physics.variation import Draw, contact_softness
+from sports.physics.variation import Draw, contact_softness, split_damping
 from sports.scene import Scene, SceneObject
 
 TOO_MUCH = 1e30
@@ -65,8 +65,10 @@ class Worlds:
         threads: int,
         out: Results,
         drawn: Draw | None = None,
+        felt_damping: bool = False,
     ) -> None:
-        """``model`` of ``mjcf``; ``drawn``: what makes the worlds differ."""
+        """``model`` of ``mjcf``; ``drawn``: what makes the worlds differ; ``felt_damping``:
+        contacts feel the joints' damping in all of them."""
         self.scene, self._trees, self._out = scene, trees, out
         n, body = out.num_worlds, scene.body
         self.batch = batch = Batch(model, nsim=n, nthread=threads)
@@ -95,8 +97,13 @@ class Worlds:
         self._timesteps: list[np.ndarray] | None = None
         self._even = np.full(n, scene.timestep)
         self._softness = model.geom_solref, model.geom_solimp
+        felt, longest = np.full(n, felt_damping), self._even
         if drawn is not None:
             self._vary(drawn)
+            felt, longest = drawn.felt, drawn.stride * scene.timestep
+        self._felt: np.ndarray | None = None
+        if felt.any():
+            self._feel(felt, longest)
         batch.reset(stage=0)
         self._fresh = batch.state[0].copy()
         self.show()
@@ -119,6 +126,8 @@ class Worlds:
                     keeper.kept.timestep[:] = timestep
             if game is not None:
                 self._law.push_worlds(game, timestep, *state)
+            if self._felt is not None:
+                np.multiply(self._felt, self.qvel, out=self._friction)
             self.batch.step()
             look_at_contacts(self._sensors, self._peaks, *forces, TOO_MUCH)
             for ball in self._balls:
@@ -207,3 +216,12 @@ class Worlds:
         self._timesteps = drawn.timesteps(self.scene.timestep, self.scene.substeps)
         if self._timesteps is not None:
             self._timestep = expand("opt.timestep")
+
+    def _feel(self, felt: np.ndarray, timestep: np.ndarray) -> None:
+        """Lets contacts feel the joints' damping in some worlds (n,) with time steps (n,)."""
+        n, expand = len(felt), self.batch.expand
+        damping = expand("dof_damping").reshape(n, self.scene.nv, -1)[:, :, 0]
+        split = split_damping(damping, self.scene.joint_dofs(), felt, timestep)
+        damping[:] = split.own
+        expand("dof_armature")[:] += split.armature
+        self._felt, self._friction = -split.force, self.batch.bind("qfrc_applied")

@@ -187,6 +187,23 @@ def test_evaluate_writes_the_schema_and_repeats_itself(tmp_path: Path):
     assert success.keys() == {"mean", "ci95", "n", "unit"} and success["n"] == 3
 
 
+def test_felt_damping_is_played_and_told(tmp_path: Path, capsys):
+    """The same falls on the ground, another motion; the result says with what it was made."""
+    results = []
+    for switch in ("", "--felt-damping"):
+        out = tmp_path / f"x{switch}.json"
+        line = f"evaluate hurdling --policy random --trials 2 {switch} --out {out}"
+        assert cli.main(line.split()) == 0
+        results.append(json.loads(out.read_text()))
+    plain, felt = results
+    assert "felt_damping" not in plain and felt["felt_damping"] is True
+    assert plain["metrics"] != felt["metrics"]
+    out = tmp_path / "drake.json"
+    line = f"evaluate hurdling --policy zero --engine drake --felt-damping --out {out}"
+    assert "always feel the joints' damping" in sentence_of(capsys, *line.split())
+    assert not out.exists()
+
+
 def finer_policy(folder: Path, **settings: object) -> Path:
     """A small policy of the long jump whose card says at which time step it was trained."""
     from rl.policy import export_policy

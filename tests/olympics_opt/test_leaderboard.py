@@ -71,6 +71,12 @@ def test_a_front_page_without_marks_changes_nothing(folder: Path):
     assert front.read_text() == "# Title\n" and not (folder / "README.md").exists()
 
 
+def test_felt_damping_is_other_physics(folder: Path):
+    before = leaderboard.read_results(folder)
+    (folder / "felt.json").write_text(json.dumps(result(felt_damping=True)))
+    assert leaderboard.read_results(folder) == before
+
+
 @pytest.mark.parametrize("text", ['{"task": ', '{"task": "x", "metrics": {}}'])
 def test_a_broken_result_is_named(folder: Path, text: str):
     (folder / "broken.json").write_text(text)

@@ -17,11 +17,14 @@ import pytest
 import torch
 
 import rl.checkpoint
+from rl.assembly import default_env
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.policy import PolicyError
 from rl.ppo import PAPER, PPOConfig
 from rl.runlog import read_progress
 from rl.train import TrainConfig, main, parse_args, train
+from sports.env import make_env
+from sports.physics.variation import Variation
 from tests.rl.toy import SMALL, toy_config, toy_env
 
 ROOT = Path(__file__).parents[2]
@@ -243,3 +246,25 @@ def test_two_ranks_learn_what_one_process_learns_from_both_batches(tmp_path):
     state = [load_checkpoint(checkpoints(tmp_path / "run")[-1], r)[1] for r in (0, 1)]
     assert torch.equal(state[0]["agent/actor.head.weight"], state[1]["agent/actor.head.weight"])
     assert not torch.equal(state[0]["env/x"], state[1]["env/x"])
+
+
+@pytest.mark.parametrize("vary", [False, True])
+def test_felt_damping_reaches_the_worlds(vary):
+    """The engine of such a run moves as one that was asked for it; with ``vary`` all worlds do."""
+    config = TrainConfig("long_jump", worlds=4, seed=2, vary=vary, felt_damping=True)
+    options = {"variation": Variation(felt_share=1.0), "variation_seed": 2} if vary else {}
+    moved = []
+    for env in (
+        default_env(config, 2),
+        make_env(
+            "long_jump", num_worlds=4, seed=2, physics_options=options | {"felt_damping": True}
+        ),
+        make_env("long_jump", num_worlds=4, seed=2),
+    ):
+        generator = torch.Generator().manual_seed(1)
+        for _ in range(8):
+            env.step(0.2 * torch.randn(4, 1, env.action_size, generator=generator))
+        moved.append(env.physics.qpos.clone())
+        env.close()
+    assert torch.equal(moved[0], moved[1])
+    assert not torch.equal(moved[0], moved[2])

@@ -376,14 +376,22 @@ def test_a_scripted_throw_with_the_strength_of_a_person_is_a_basket():
     assert bends == pytest.approx(-9.81, abs=0.05)
 
 
-@pytest.mark.parametrize(("engine", "divisor"), [("mujoco", 2), ("drake", 1)])
-def test_the_throw_is_the_same_at_half_the_time_step_and_in_drake(engine: str, divisor: int):
+def test_the_throw_is_the_same_at_half_the_time_step():
     """Its release, within half a metre per second: what hands do to the ball is no artefact."""
-    if engine == "drake":
-        pytest.importorskip("pydrake")
     _, here = scripted_throw("mujoco", threads=1)
-    _, there = scripted_throw(engine, divisor)
+    _, there = scripted_throw("mujoco", 2, threads=1)
     for name, tolerance in (("release_speed", 0.5), ("release_height", 0.06)):
+        expected = float(here.metrics[name])
+        assert float(there.metrics[name]) == pytest.approx(expected, abs=tolerance), name
+
+
+def test_the_throw_is_the_same_in_drake():
+    """At its time step, where MuJoCo's contacts feel the damping too: 6.85 and 6.72 m/s. At 1/240 s
+    MuJoCo throws with 7.4 m/s (docs/physics.md, Throwing)."""
+    pytest.importorskip("pydrake")
+    _, here = scripted_throw("mujoco", 4, threads=1, felt_damping=True)
+    _, there = scripted_throw("drake")
+    for name, tolerance in (("release_speed", 0.3), ("release_height", 0.06)):
         expected = float(here.metrics[name])
         assert float(there.metrics[name]) == pytest.approx(expected, abs=tolerance), name
 
