@@ -35,12 +35,6 @@ FOOT_SPEED, LIFT = 3.0, 0.8
 """Before its impact the take-off foot comes down at most so fast (m/s), and the impact gives the
 centre of mass at most so much upward speed (m/s): a quarter of the athlete, the distal mass of
 Seyfarth 1999 (J Biomech 32:1259), brought to rest, where faster legs are found to jump further."""
-BEHIND = (
-    *("Pelvis", "Chest", "Head"),
-    *(f"{side}_{link}" for side in "LR" for link in ("Hip", "Shoulder", "Elbow", "Hand")),
-)
-"""Links of which the first ball, that at their own joint, must come down beyond the length. More
-points of the same limbs say the same again, and the solver takes twice as long."""
 LIMB_RATE = 18.0
 """Before the impact hinges turn at most so fast (rad/s): the speed at which hip and ankle of the
 strength table carry no load."""
@@ -126,7 +120,7 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     program.ground(left, flight[1:4], margin=0.0)
     program.ground(left, flight[4:-1])
     whole = outline(body, sagittal=True)
-    behind = {b.link: b for b in reversed(whole) if b.link in BEHIND}.values()
+    behind = [b for b in whole if not b.link.endswith(("Knee", "Ankle", "Toe"))]
     rest = [
         b
         for b in whole
