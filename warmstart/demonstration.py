@@ -37,7 +37,7 @@ class Demonstration:
 
     @property
     def passed(self) -> bool:
-        """Certified, and in MuJoCo a success by the task's own rules that reaches what was asked."""
+        """Certified, and in MuJoCo a success by the task's rules that reaches what was asked."""
         return self.clip is not None and not self.reason
 
 

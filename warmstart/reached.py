@@ -89,7 +89,14 @@ def reached(path: Path) -> Reached:
 def table() -> str:
     """The page: a Markdown table of all shipped jumps, hurdles and lunges."""
     rows = [reached(path) for name in OUTCOME for path in demonstration_files(name)]
-    head = ["clip", "asked (m)", "planned (m)", "in MuJoCo (m)", "open loop in Drake (m)", "besides"]
+    head = [
+        "clip",
+        "asked (m)",
+        "planned (m)",
+        "in MuJoCo (m)",
+        "open loop in Drake (m)",
+        "besides",
+    ]
     lines = [head, ["---", *["---:"] * 4, "---"], *(row.cells() for row in rows)]
     return HEAD + "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 

@@ -49,7 +49,7 @@ def test_a_ball_on_the_ground_has_fallen():
 
 
 def test_a_margin_that_is_no_margin_is_a_sentence():
-    with pytest.raises(ValueError, match="margin must lie between 0 and 1 m, not -0.1"):
+    with pytest.raises(ValueError, match=r"margin must lie between 0 and 1 m, not -0\.1"):
         long_jump.Config(margin=-0.1)
 
 
