@@ -37,7 +37,7 @@ class Demonstration:
 
     @property
     def passed(self) -> bool:
-        """Certified, and a success by the task's own rules in MuJoCo."""
+        """Certified, and in MuJoCo a success by the task's rules that reaches what was asked."""
         return self.clip is not None and not self.reason
 
 
@@ -81,6 +81,8 @@ def demonstrate(
     reason = ""
     if not tracked.success:
         reason = f"tracked in MuJoCo, the task calls it no success: {clip.meta['achieved']}"
+    elif tracked.share < 1.0:
+        reason = f"tracked in MuJoCo, it reaches {100 * tracked.share:.1f} % of what was asked"
     return Demonstration(certificate, replace(clip, meta=meta), reason)
 
 

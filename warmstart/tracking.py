@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -30,10 +30,8 @@ from warmstart.clip import Clip, clip_from_solution
 from warmstart.outcome import OUTCOMES, flight_events
 from warmstart.replay import play, scene_of, scene_options
 from warmstart.solution import Solution
-from warmstart.tracking_cost import JumpRules, Reference, Weights, jump_rules
+from warmstart.tracking_cost import JumpRules, Reference, Weights, jump_rules, weights_of
 
-ENOUGH = 0.98
-"""Share of the asked outcome at which no further attempt is made."""
 _VEL = int(mujoco.mjtStage.mjSTAGE_VEL)
 _State = tuple[np.ndarray, np.ndarray, np.ndarray]  # qpos, qvel, the solver's warm start
 
@@ -60,7 +58,8 @@ class Tracking:
     lost: float = math.inf
     """Mean distance of the links from the reference's (m) beyond which the rest is given up."""
     seed: int = 0
-    weights: Weights = field(default_factory=Weights)
+    weights: Weights | None = None
+    """None: those of the motion's problem (``weights_of``)."""
 
     def __post_init__(self) -> None:
         if not self.lost > 0:
@@ -87,6 +86,14 @@ class Tracked:
     def success(self) -> bool:
         """Whether the task called the motion a success."""
         return self.clip.meta.get("achieved", {}).get("success") == 1.0
+
+    @property
+    def share(self) -> float:
+        """The outcome over the one asked for, at most 1; 1 where a task measures no such thing."""
+        meta = self.clip.meta
+        name = OUTCOMES[meta["problem"]].field if meta.get("problem") in OUTCOMES else ""
+        asked, achieved = (meta.get(which, {}).get(name) for which in ("asked", "achieved"))
+        return min(achieved / asked, 1.0) if asked and achieved else 1.0
 
 
 class Worlds:
@@ -178,14 +185,15 @@ def track(
     begin = time.perf_counter()
     worlds = Worlds(scene, settings.worlds, threads)
     frames = _reference(clip, worlds)
+    weights = settings.weights or weights_of(clip.meta.get("problem", ""))
     steps, rules = len(frames.ctrl) - 1, None
     outcome = OUTCOMES.get(clip.meta.get("problem", ""))
     if clip.meta.get("problem") in task_names():
         after = settings.after if outcome is None else min(settings.after, outcome.after)
         frames = frames.held(after)  # the bar and the mark are lost after the landing
     if clip.meta.get("problem") == "long_jump":
-        rules = jump_rules(clip, scene, settings.weights)
-    qpos, qvel, ctrl = _follow(frames, steps, worlds, settings, rules, progress)
+        rules = jump_rules(clip, scene, weights)
+    qpos, qvel, ctrl = _follow(frames, steps, worlds, settings, weights, rules, progress)
     tracked = replace(
         clip,
         fps=1.0 / scene.control_timestep,
@@ -230,7 +238,7 @@ def track_best(
     progress: Callable[[int, int], None] | None = None,
 ) -> Tracked:
     """Tracks in the task's scene until the task calls it a success with the outcome that was asked
-    for, up to ``ENOUGH``, that does not touch the bar; else the best of all ``attempts``: a
+    for that does not touch the bar; else the best of all ``attempts``: a
     success, then the outcome, then a bar that was not touched, then the error of the links.
 
     Each attempt draws other noise, the later ones more of it. Raises ValueError for a reference
@@ -254,19 +262,11 @@ def track_best(
             continue
         if best is None or _rank(found) > _rank(best):
             best = found
-        if best.success and _share(best) >= ENOUGH and _clear(best):
+        if best.success and best.share >= 1.0 and _clear(best):
             return best
     if best is None:
         raise RuntimeError(f"none of {attempts} attempts could be simulated: {reason}")
     return best
-
-
-def _share(tracked: Tracked) -> float:
-    """The outcome over the one asked for, at most 1; 1 where a task measures no such thing."""
-    meta = tracked.clip.meta
-    name = OUTCOMES[meta["problem"]].field if meta["problem"] in OUTCOMES else ""
-    asked, achieved = meta.get("asked", {}).get(name), meta.get("achieved", {}).get(name)
-    return min(achieved / asked, 1.0) if asked and achieved else 1.0
 
 
 def _clear(tracked: Tracked) -> bool:
@@ -275,7 +275,7 @@ def _clear(tracked: Tracked) -> bool:
 
 
 def _rank(tracked: Tracked) -> tuple[bool, float, bool, float]:
-    return tracked.success, _share(tracked), _clear(tracked), -tracked.link_error
+    return tracked.success, tracked.share, _clear(tracked), -tracked.link_error
 
 
 def _reference(clip: Clip, worlds: Worlds) -> Reference:
@@ -302,12 +302,13 @@ def _follow(
     end: int,
     worlds: Worlds,
     settings: Tracking,
+    weights: Weights,
     rules: JumpRules | None,
     progress: Callable[[int, int], None] | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The receding horizon loop: qpos (T, 7 + n), qvel (T, 6 + n) and ctrl (T, n)."""
     scene, body, n = worlds.scene, worlds.scene.body, settings.worlds
-    rng, weights = np.random.default_rng(settings.seed), settings.weights
+    rng = np.random.default_rng(settings.seed)
     unit = np.minimum(body.array("effort") / body.array("kp"), 0.5)
     limit = body.action_scale()
     q, v = scene.agent_qpos(0), scene.agent_qvel(0)

@@ -67,7 +67,9 @@ def test_a_jump_s_own_targets_lead_along_it_from_its_first_frame():
     for t in range(1, clip.num_frames):
         physics.step(torch.tensor(clip.ctrl[t - 1 : t], dtype=torch.float32))
         off = physics.body_pos[0, 0] - motions.at(torch.tensor([t])).pos[0]
-        assert torch.linalg.vector_norm(off, dim=-1).mean() < 0.02
+        # The rounding of the first velocities grows in every contact of the landing.
+        bound = 0.012 if t <= clip.meta["events"]["landing"] * clip.fps else 0.05
+        assert torch.linalg.vector_norm(off, dim=-1).mean() < bound
     physics.close()
 
 
