@@ -12,21 +12,15 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.distributions import Normal, kl_divergence
 
-from rl.latent import (
-    KEEP,
-    Distiller,
-    FrozenNormalizer,
-    PriorConfig,
-    absolute_action,
-    annealed,
-    gaussian_kl,
-    options_of,
-)
+from rl.latent import KEEP, Distiller, FrozenNormalizer, absolute_action
+from rl.latent_config import PriorConfig, options_of
+from rl.latent_terms import annealed, awaken, gaussian_kl, hinge_weights, steered
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError
 from rl.tracker import TrackingConfig, TrackingEnv, make_tracking_env
-from rl.tracking_terms import least_turn, nearest_turn
+from rl.tracking_terms import least_turn
 from sports.physics.base import PhysicsState
+from sports.turns import nearest_turn
 from tests.rl.latent_made import golf
 from tests.warmstart.clips_made import random_clip
 from warmstart.clip import Clip
@@ -43,6 +37,10 @@ SMALL = PriorConfig(
     epochs=2,
     learning_rate=2e-3,
     smooth=0.0,
+    pose=False,
+    stiffness=0.0,
+    nats=(0.0, 0.0),
+    beta=(0.01, 0.001),
 )
 
 

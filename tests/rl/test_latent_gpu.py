@@ -6,7 +6,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rl.latent import Distiller, PriorConfig
+from rl.latent import Distiller
+from rl.latent_config import PriorConfig
 from rl.latent_action import LatentActions, LatentConfig
 from rl.networks import MLP
 from rl.policy import Policy
