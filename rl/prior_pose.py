@@ -69,7 +69,7 @@ class PosePart(nn.Module):
             raise ValueError(f"body '{body.name}' has joints of other than three hinges")
         self.own = own
         self.size = own.stop - own.start
-        self.register_buffer("parents", torch.tensor(body.parents), persistent=False)
+        self.register_buffer("parents", torch.as_tensor(body.parents()), persistent=False)
         scale = torch.tensor(body.action_scale(), dtype=torch.float32)
         self.register_buffer("scale", scale, persistent=False)
         self.register_buffer("mean", mean.detach().float().cpu().clone(), persistent=False)
