@@ -191,11 +191,19 @@ class Distiller:
     def act(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """obs (M, D) raw, of the worlds as they are -> stored obs (M, D), the student's disturbed
         action (M, n), the action that the teacher would take (M, n), whether one can reach its
-        targets or not, zeros (M,)."""
+        targets or not, zeros (M,). Of the worlds that play alone the student's follows no clip."""
         stored = self.prepare(obs)
         with self._autocast():
             residual = self._teacher(stored)
             latent, _ = self.nets.posterior(stored)
+            if self.config.alone > 0.0:
+                mean, logvar = self.nets.expected(stored[:, : self.self_size])
+                drawn = torch.randn(mean.shape, device=self.device, generator=self.generator)
+                row = torch.arange(len(mean), device=self.device)
+                # The last ones: noise is of the first.
+                alone = row >= (1.0 - self.config.alone) * len(mean)
+                drawn = mean + (0.5 * logvar).exp() * drawn
+                latent = torch.where(alone[:, None], drawn, latent)
             action = self.nets.decode(stored[:, : self.self_size], latent)
         label = absolute_action(self.env, residual.to(self.env.device)).to(self.device)
         if self.nets.part is not None:

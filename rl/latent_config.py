@@ -60,6 +60,9 @@ class PriorConfig:
     """Standard deviation (action units, 1 = pi rad) of noise on the actions of noisy worlds."""
     noisy: float = 0.5
     """Share of the worlds with noise."""
+    alone: float = 0.1
+    """Share of the worlds that act by latents drawn from the prior, whatever their clip; the
+    tracker's answer is the way back from where the prior leads."""
     push_seconds: float = 2.0
     """Mean time between pushes of a world; 0 for none."""
     push: float = 0.7
@@ -83,11 +86,11 @@ class PriorConfig:
         if min(self.nats) <= 0.0 and self.nats != (0.0, 0.0):
             raise ValueError("nats must be positive, or 0 0 for a beta that is not steered")
         parts = (self.beta_share, self.nats_share)
-        if not all(0.0 <= s <= 1.0 for s in (self.noisy, self.fallen)) or not all(
+        if not all(0.0 <= s <= 1.0 for s in (self.noisy, self.alone, self.fallen)) or not all(
             0.0 < s <= 1.0 for s in parts
         ):
             raise ValueError(
-                "noisy and fallen must lie in [0, 1], beta_share and nats_share in (0, 1]"
+                "noisy, alone and fallen must lie in [0, 1], beta_share and nats_share in (0, 1]"
             )
 
     def shape(self, obs_size: int, self_size: int, action_size: int) -> Shape:

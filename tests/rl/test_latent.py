@@ -14,7 +14,7 @@ from torch.distributions import Normal, kl_divergence
 
 from rl.latent import KEEP, Distiller, FrozenNormalizer, absolute_action
 from rl.latent_config import PriorConfig, options_of
-from rl.latent_terms import annealed, awaken, gaussian_kl, hinge_weights, steered
+from rl.latent_terms import annealed, gaussian_kl, hinge_weights, steered
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError
 from rl.tracker import TrackingConfig, TrackingEnv, make_tracking_env
@@ -280,6 +280,36 @@ def test_acting_labels_with_the_teacher_and_disturbs_some_worlds():
         plain = learner.nets.decode(stored[:, :358], mean)
     torch.testing.assert_close(action[4:], plain[4:])
     assert 0.03 < float((action - plain)[:4].std()) < 0.07
+    env.close()
+
+
+def test_some_worlds_act_by_the_prior_alone():
+    env = tracking_env(golf(), worlds=8)
+    config = dataclasses.replace(SMALL, noise=0.0, alone=0.5)
+    learner = Distiller(env, teacher(env), config, seed=4)
+    obs = env.reset()[:, 0]
+    goal = obs.clone()
+    goal[:, 358:] *= -1.0
+    actions = []
+    for seen in (obs, goal):
+        learner.generator.manual_seed(7)
+        stored, action, label, _ = learner.act(seen)
+        actions.append(action)
+        torch.testing.assert_close(label, absolute_action(env, learner._teacher(stored)))
+    # What the goal shows moves those that follow it alone.
+    assert torch.equal(actions[0][4:], actions[1][4:])
+    assert float((actions[0] - actions[1])[:4].abs().amax(-1).min()) > 1e-4
+    # Draws of the prior: as many as it takes give its decoded mean and spread.
+    draws = torch.stack([learner.act(obs)[1][4:] for _ in range(400)])
+    with torch.no_grad():
+        stored = learner.prepare(obs)[4:, :358]
+        mean, logvar = learner.nets.expected(stored)
+        noise = torch.randn(2000, 4, 8, generator=torch.Generator().manual_seed(0))
+        wanted = learner.nets.decode(
+            stored.expand(2000, -1, -1), mean + (0.5 * logvar).exp() * noise
+        )
+    torch.testing.assert_close(draws.mean(0), wanted.mean(0), atol=0.02, rtol=0)
+    torch.testing.assert_close(draws.std(0).mean(), wanted.std(0).mean(), rtol=0.1, atol=0)
     env.close()
 
 

@@ -84,7 +84,7 @@ def test_the_difference_is_that_of_the_clips_hinges():
 
 def test_columns_that_are_no_rotation_become_one():
     g = torch.Generator().manual_seed(2)
-    rot = torch.tensor(Rotation.random(50, random_state=1).as_matrix()).float()
+    rot = torch.tensor(Rotation.random(50, rng=1).as_matrix()).float()
     columns = rot[..., :2].transpose(-1, -2).flatten(-2)
     torch.testing.assert_close(rotations(columns), rot, atol=1e-5, rtol=0)
     found = rotations(columns + 0.05 * torch.randn(50, 6, generator=g))
