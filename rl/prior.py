@@ -38,8 +38,7 @@ SEARCH = "OLYMPICS_OPT_PRIORS"
 """Environment variable: folders in which priors are looked for."""
 LOGVAR = (-5.0, 2.0)
 """Log variances are clamped to this (PULSE)."""
-HEAD_GAIN = 0.1
-"""Of the networks' last layers at first."""
+HEAD_GAIN = 0.1  # of the networks' last layers at first
 _SIZES = ("obs_size", "self_size", "action_size", "latent")
 _HIDDEN = ("encoder", "prior", "decoder")
 MAX_WIDTH, MAX_LAYERS = 1 << 16, 64
@@ -65,9 +64,7 @@ class Shape:
     decoder: tuple[int, ...]
     activation: str = "silu"
     pose: bool = False
-    """The decoder says how far targets are from the pose, and the encoder sees how far the
-    reference's pose is from the athlete's (``rl.prior_pose``); priors of the first versions do
-    neither."""
+    """Decoder and encoder work around the pose (``rl.prior_pose``); the first priors did not."""
 
     @staticmethod
     def of(card: Mapping[str, Any]) -> Shape:
@@ -122,10 +119,8 @@ class LatentNets(nn.Module):
     def decode(self, body: Tensor, z: Tensor) -> Tensor:
         """(..., S), (..., Z) -> (..., n) PD targets in units of the body's action scale."""
         action = self.decoder(torch.cat((body, z.to(body.dtype)), -1))
-        if self.shape.pose:
-            assert self.part is not None
-            action = self.part.pose(body) + action
-        return action
+        assert self.part is not None or not self.shape.pose
+        return action if self.part is None else self.part.pose(body) + action
 
     def see_pose(self, body: Body, mean: Tensor, std: Tensor) -> None:
         """Says how observations of a ``body`` were normalised, (D,) or (S,): needed before the
