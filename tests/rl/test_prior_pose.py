@@ -16,6 +16,7 @@ from rl.prior import LatentNets, LatentPrior, PriorError, load_prior, save_prior
 from rl.prior_pose import SHOWN, PosePart, joint_angles, rotations
 from rl.tracker import TrackingConfig, make_tracking_env
 from rl.tracking_terms import least_turn, wrapped
+from sports.env import make_env
 from sports.frames import proprioception_slices
 from sports.humanoid.body import load_body
 from sports.physics.base import PhysicsState
@@ -149,6 +150,42 @@ def test_athletes_on_either_turn_do_the_same_under_the_same_actions():
 def test_who_acts_by_rotations_has_targets_on_its_own_turns():
     assert env_of(1, "absolute").own_turns
     assert not env_of(1, "residual").own_turns
+
+
+def test_each_of_two_athletes_has_its_own_turns():
+    env = make_env("boxing", num_worlds=2)
+    env.reset()
+    zero = torch.zeros(2, 2, 69)
+    plain = env.targets(zero)
+    env.own_turns = True
+    torch.testing.assert_close(env.targets(zero), plain, atol=1e-6, rtol=0)
+    state = env.physics.qpos.clone()
+    joint = env.physics.scene.agent_qpos(1).start + 7 + 3 * 4
+    state[1, joint : joint + 3] += 2.0 * math.pi
+    everyone, qvel = torch.ones(2, dtype=torch.bool), env.physics.qvel.clone()
+    env.physics.reset(everyone, PhysicsState(state, qvel, env.physics.mocap_pos.clone()))
+    moved = (env.targets(zero) - plain) / (2.0 * math.pi)
+    expected = torch.zeros_like(plain)
+    expected[1, 1, 12:15] = 1.0
+    torch.testing.assert_close(moved, expected, atol=1e-6, rtol=0)
+    env.close()
+
+
+def test_the_athlete_with_fingers_has_a_pose_too():
+    body = load_body("smplx")
+    size = 15 * body.num_links - 2
+    own = proprioception_slices(body.num_links)["body_rot"]
+    part = PosePart(body, own, torch.zeros(size), torch.ones(size))
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-1.0, 1.0, (body.num_links - 1, 3))
+    rot = [Rotation.identity()]
+    for parent, row in zip(body.parents()[1:], angle):
+        rot.append(rot[parent] * Rotation.from_euler("XYZ", row))
+    obs = torch.zeros(size)
+    columns = np.stack([r.as_matrix()[:, :2].T.ravel() for r in rot])
+    obs[own] = torch.tensor(columns.ravel()).float()
+    found = (part.pose(obs) * part.scale).reshape(-1, 3)
+    torch.testing.assert_close(found, torch.tensor(angle).float(), atol=1e-4, rtol=0)
 
 
 # Priors of both kinds.
