@@ -28,7 +28,7 @@ class PriorConfig:
     reference's pose is from the athlete's; else they learn hinge angles from rotations."""
     stiffness: float = 0.5
     """The error of a hinge counts by this power of its servo's stiffness; 0 for all alike."""
-    nats: tuple[float, float] = (60.0, 22.0)
+    nats: tuple[float, float] = (60.0, 28.0)
     """KL divergence of the posterior from the prior to which beta is steered, first and last; 0 0
     for a beta that falls as ``beta`` says."""
     nats_share: float = 0.6
