@@ -200,7 +200,7 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
 def task_options(task: str) -> type:
     """The options' dataclass of a task. Raises ValueError for an unknown one."""
     if task == PRIOR:
-        from rl.latent import PriorConfig
+        from rl.latent_config import PriorConfig
 
         return PriorConfig
     if task == TRACKING:

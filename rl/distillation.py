@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from rl.config import TRACKING, TrainConfig
-from rl.latent import PriorConfig, options_of
+from rl.latent_config import PriorConfig, options_of
 from rl.policy import Policy, load_policy
 from rl.tracker import Tracking, TrackingConfig, TrackingEnv, make_tracking_env
 from rl.tracker_evaluation import tracking_config

@@ -11,87 +11,29 @@ Shapes: T steps, M worlds, D observation, S of it the body, Z latent, n hinges.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
 from rl.graph import GraphedStep
+from rl.latent_config import PriorConfig
+from rl.latent_terms import annealed, awaken, gaussian_kl, hinge_weights, steered
 from rl.learned import learned_state, load_learned
 from rl.networks import autocast
 from rl.policy import Policy
-from rl.prior import FORMAT, LatentNets, Shape, body_digest, check_layout, self_layout
+from rl.prior import (
+    FORMAT,
+    LatentNets,
+    body_digest,
+    check_layout,
+    self_layout,
+)
 from rl.ranks import SharedGradients, SharedStep, own_rank
 from rl.rollout import Rollout
 from rl.tracker import TrackingEnv
-from rl.tracking_terms import nearest_turn
-
-
-@dataclass(frozen=True)
-class PriorConfig:
-    """Options of the distillation."""
-
-    split: Literal["train", "held_out", "all"] = "train"
-    """Clips of the library to learn from, as of the tracker."""
-    latent: int = 32
-    """Numbers of a latent; 48 suits the athlete with fingers."""
-    encoder: tuple[int, ...] = (1024, 512)
-    """Hidden layers. Those of the paper are 1536 1024 512, and 3096 2048 1024 for the decoder; the
-    defaults are 4 M weights, enough for an hour of motion."""
-    prior: tuple[int, ...] = (512, 512)
-    """Hidden layers."""
-    decoder: tuple[int, ...] = (1024, 1024, 512)
-    """Hidden layers."""
-    beta: tuple[float, float] = (0.01, 0.001)
-    """Weight of the KL divergence (nats) of the posterior from the prior, first and last."""
-    beta_share: float = 0.7
-    """Part of the run over which beta falls, geometrically."""
-    smooth: float = 0.005
-    """Weight of |mu_t - 0.99 mu_(t-1)|."""
-    steps: int = 24
-    """Control steps per world and iteration."""
-    minibatches: int = 8
-    """Minibatches (of worlds) per epoch."""
-    epochs: int = 4
-    """Passes over the rollout per iteration."""
-    learning_rate: float = 5e-4
-    """Of Adam, at first."""
-    learning_rate_final: float = 1e-4
-    """At the end of the run, reached geometrically."""
-    grad_norm: float = 10.0
-    """Gradients are scaled down to this norm."""
-    noise: float = 0.02
-    """Standard deviation (action units, 1 = pi rad) of noise on the actions of noisy worlds."""
-    noisy: float = 0.5
-    """Share of the worlds with noise."""
-    push_seconds: float = 2.0
-    """Mean time between pushes of a world; 0 for none."""
-    push: float = 0.7
-    """Largest change of the root's velocity by a push (m/s), in each horizontal direction."""
-    fallen: float = 0.05
-    """Share of episodes that start with a fall."""
-    tolerance: float = 0.5
-    """Distance (m) of any link but the feet from the reference at which an episode ends."""
-
-    def __post_init__(self) -> None:
-        sizes = (self.latent, *self.encoder, *self.prior, *self.decoder)
-        if min(*sizes, self.steps - 1, self.minibatches, self.epochs) < 1:
-            raise ValueError("sizes, minibatches and epochs must be at least 1, steps at least 2")
-        if min(*self.beta, self.learning_rate, self.learning_rate_final, self.tolerance) <= 0.0:
-            raise ValueError("beta, learning rates and tolerance must be positive")
-        if min(self.smooth, self.noise, self.push_seconds, self.push) < 0.0:
-            raise ValueError("smooth, noise and pushes must not be negative")
-        shares = (self.noisy, self.fallen)
-        if not all(0.0 <= s <= 1.0 for s in shares) or not 0.0 < self.beta_share <= 1.0:
-            raise ValueError("noisy and fallen must lie in [0, 1], beta_share in (0, 1]")
-
-    def shape(self, obs_size: int, self_size: int, action_size: int) -> Shape:
-        """The networks' sizes for an athlete."""
-        hidden = (self.encoder, self.prior, self.decoder)
-        return Shape(obs_size, self_size, action_size, self.latent, *hidden)
-
+from sports.turns import nearest_turn
 
 KEEP = 0.99
 """Of a latent from step to step, in the smoothness term (PULSE)."""
@@ -99,21 +41,6 @@ ACTIVE = 0.01
 """Nats of mean KL divergence above which a dimension of the latent carries something."""
 STATISTICS = ("loss", "action_error", "kl", "active", "smoothness", "beta", "reach")
 """What ``Distiller.update`` reports."""
-
-
-def gaussian_kl(mean: Tensor, logvar: Tensor, mean_p: Tensor, logvar_p: Tensor) -> Tensor:
-    """(..., Z) KL divergence (nats) of N(mean, exp logvar) from N(mean_p, exp logvar_p), float32.
-
-    0.5 (log s_p^2 - log s^2 + (s^2 + (m - m_p)^2) / s_p^2 - 1).
-    """
-    mean, logvar, mean_p, logvar_p = (x.float() for x in (mean, logvar, mean_p, logvar_p))
-    apart = (logvar.exp() + (mean - mean_p).square()) * (-logvar_p).exp()
-    return 0.5 * (logvar_p - logvar + apart - 1.0)
-
-
-def annealed(first: float, last: float, share: float) -> float:
-    """From first to last, geometrically, as ``share`` goes from 0 to 1."""
-    return first * (last / first) ** min(max(share, 0.0), 1.0)
 
 
 class FrozenNormalizer:
@@ -182,6 +109,10 @@ class Distiller:
         weights = torch.Generator().manual_seed(seed)
         shape = config.shape(env.obs_size, self.self_size, env.action_size)
         self.nets = LatentNets(shape, weights).to(self.device)
+        awaken(self.nets, config.start_sigma)
+        self.nets.see_pose(body, teacher.mean, teacher.std)
+        stiffness = torch.as_tensor(body.array("kp"), device=self.device)
+        self._weights = hinge_weights(stiffness, config.stiffness)
         self.card: dict[str, Any] = {
             "format": FORMAT,
             "algo": "distillation",
@@ -202,6 +133,9 @@ class Distiller:
             return torch.tensor(value, dtype=torch.float32, device=self.device)
 
         self.learning_rate, self.beta = scalar(config.learning_rate), scalar(config.beta[0])
+        self._steered = config.nats[0] > 0.0
+        self.target = config.nats[0]
+        """Nats to which beta is steered."""
         self.sigma = scalar(config.noise)
         """Of the noise on actions."""
         self.actor_weight = scalar(1.0)
@@ -235,9 +169,13 @@ class Distiller:
         return Rollout(c.steps, rows, *sizes, self.device, self.obs_dtype)
 
     def schedule(self, share: float) -> None:
-        """Sets beta and learning rate for the part of the run that is done."""
+        """Sets beta, or the divergence that it is steered to, and the learning rate for the part of
+        the run that is done."""
         c = self.config
-        self.beta.fill_(annealed(*c.beta, share / c.beta_share))
+        if self._steered:
+            self.target = annealed(*c.nats, share / c.nats_share)
+        else:
+            self.beta.fill_(annealed(*c.beta, share / c.beta_share))
         self.learning_rate.fill_(annealed(c.learning_rate, c.learning_rate_final, share))
 
     # -- acting ---------------------------------------------------------------------------------
@@ -253,13 +191,23 @@ class Distiller:
     def act(self, obs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """obs (M, D) raw, of the worlds as they are -> stored obs (M, D), the student's disturbed
         action (M, n), the action that the teacher would take (M, n), whether one can reach its
-        targets or not, zeros (M,)."""
+        targets or not, zeros (M,). Of the worlds that play alone the student's follows no clip."""
         stored = self.prepare(obs)
         with self._autocast():
             residual = self._teacher(stored)
             latent, _ = self.nets.posterior(stored)
+            if self.config.alone > 0.0:
+                mean, logvar = self.nets.expected(stored[:, : self.self_size])
+                drawn = torch.randn(mean.shape, device=self.device, generator=self.generator)
+                row = torch.arange(len(mean), device=self.device)
+                # The last ones: noise is of the first.
+                alone = row >= (1.0 - self.config.alone) * len(mean)
+                drawn = mean + (0.5 * logvar).exp() * drawn
+                latent = torch.where(alone[:, None], drawn, latent)
             action = self.nets.decode(stored[:, : self.self_size], latent)
         label = absolute_action(self.env, residual.to(self.env.device)).to(self.device)
+        if self.nets.part is not None:
+            label = self.nets.part.as_seen(stored, label)
         label = torch.nan_to_num(label)  # of a world that diverges, which counts for nothing
         noisy = torch.arange(len(action), device=self.device) < self.config.noisy * len(action)
         noise = torch.randn(action.shape, device=self.device, generator=self.generator)
@@ -271,9 +219,10 @@ class Distiller:
     def update(self, rollout: Rollout) -> dict[str, Tensor]:
         """Learns from a rollout; the next one may overwrite it. Returns () statistics.
 
-        loss; action_error: L2 norm of the reconstructed action's error (action units); kl: nats
-        of the posterior from the prior; active: dimensions of the latent with more than ACTIVE
-        nats; smoothness; beta; reach: share of the teacher's targets that no action reaches.
+        loss; action_error: L2 norm of the reconstructed action's error (action units, hinges by
+        weight); kl: nats of the posterior from the prior; active: dimensions of the latent with
+        more than ACTIVE nats; smoothness; beta, of this update; reach: share of the teacher's
+        targets that no action reaches.
         """
         c = self.config
         self._prepare_batch(rollout)
@@ -296,6 +245,8 @@ class Distiller:
         divergence, beyond = whole[3:-1], whole[-1]
         active = (divergence > ACTIVE).sum().float()
         numbers = (loss, error, divergence.sum(), active, smoothness, self.beta.clone(), beyond)
+        if self._steered:
+            self.beta.copy_(steered(self.beta, divergence.sum(), self.target, c.steer))
         return dict(zip(STATISTICS, numbers))
 
     def _prepare_batch(self, r: Rollout) -> None:
@@ -322,7 +273,8 @@ class Distiller:
             mean, logvar = self.nets.posterior(obs)
             mean_p, logvar_p = self.nets.expected(body)
             action = self.nets.decode(body, mean + (0.5 * logvar).exp() * noise)
-        error = torch.linalg.vector_norm(action - label.clamp(-1.0, 1.0), dim=-1)
+        off = self._weights * (action - label.clamp(-1.0, 1.0))
+        error = torch.linalg.vector_norm(off, dim=-1)
         divergence = gaussian_kl(mean, logvar, mean_p, logvar_p)
         moved = torch.linalg.vector_norm(mean[1:] - KEEP * mean[:-1], dim=-1)
         return error, divergence, moved
@@ -365,6 +317,7 @@ class Distiller:
         state = learned_state(dict(self.nets.named_parameters()), self.optimizer, "nets.")
         norm = {f"normalizer.{k}": getattr(self.obs_norm, k) for k in ("mean", "std")}
         own = {"teacher": self._digest(), "generator": self.generator.get_state()}
+        own["beta"] = self.beta.clone()
         return state | norm | own
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -373,12 +326,5 @@ class Distiller:
             raise ValueError("the run learned from another tracker: resume it with that one")
         load_learned(dict(self.nets.named_parameters()), self.optimizer, state, "nets.")
         self.generator.set_state(state["generator"].cpu())
-
-
-def options_of(options: dict[str, Any]) -> PriorConfig:
-    """A PriorConfig from the options of a run, lists of JSON or tuples. Raises ValueError."""
-    known = {f.name for f in fields(PriorConfig)}
-    if unknown := sorted(set(options) - known):
-        raise ValueError(f"the distillation has no option '{unknown[0]}'")
-    plain: Any = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
-    return PriorConfig(**plain)
+        if "beta" in state:  # not of runs before beta was steered
+            self.beta.copy_(state["beta"])

@@ -19,7 +19,7 @@ def make_distiller(
 ) -> Distiller:
     """The learner of a run of the task ``prior``."""
     from rl.distillation import teacher_of
-    from rl.latent import options_of
+    from rl.latent_config import options_of
 
     how = (config.seed, config.cuda_graph, bf16)
     return Distiller(env, teacher_of(config), options_of(config.options), device, *how)

@@ -147,6 +147,7 @@ class Policy:
             config = LatentConfig(**{k: v for k, v in own.items() if k != "prior_digest"})
             self.layer = LatentActions(self.prior, config, scene, env.task.tools, env.device)
             self.layer.check(env.obs_slices)
+            env.own_turns = True  # as in training, where the environment has the layer
         except (ValueError, TypeError) as error:
             raise PolicyError(f"the policy's latents mean nothing here: {error}") from error
         return self.layer.size

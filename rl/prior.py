@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from rl import pretrained
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.networks import MLP
+from rl.prior_pose import PosePart
 from sports.frames import proprioception_slices
 from sports.humanoid.body import Body, load_body
 from warmstart.atomic import write_bytes, write_text
@@ -37,6 +38,7 @@ SEARCH = "OLYMPICS_OPT_PRIORS"
 """Environment variable: folders in which priors are looked for."""
 LOGVAR = (-5.0, 2.0)
 """Log variances are clamped to this (PULSE)."""
+HEAD_GAIN = 0.1  # of the networks' last layers at first
 _SIZES = ("obs_size", "self_size", "action_size", "latent")
 _HIDDEN = ("encoder", "prior", "decoder")
 MAX_WIDTH, MAX_LAYERS = 1 << 16, 64
@@ -61,6 +63,8 @@ class Shape:
     prior: tuple[int, ...]
     decoder: tuple[int, ...]
     activation: str = "silu"
+    pose: bool = False
+    """Decoder and encoder work around the pose (``rl.prior_pose``); the first priors did not."""
 
     @staticmethod
     def of(card: Mapping[str, Any]) -> Shape:
@@ -68,20 +72,22 @@ class Shape:
         try:
             numbers: dict[str, Any] = {k: card[k] for k in _SIZES}
             hidden: dict[str, Any] = {k: tuple(card["hidden"][k]) for k in _HIDDEN}
-            activation = str(card["activation"])
+            activation, pose = str(card["activation"]), card.get("pose", False)
         except (KeyError, TypeError) as error:
             raise ValueError(f"its sizes are missing ({error})") from None
         widths = [*numbers.values(), *(n for h in hidden.values() for n in h)]
         proper = all(type(n) is int and 0 < n < MAX_WIDTH for n in widths)
         if not proper or len(widths) > MAX_LAYERS:
             raise ValueError(f"its layer sizes {widths} are impossible")
-        return Shape(**numbers, **hidden, activation=activation)
+        if not isinstance(pose, bool):
+            raise ValueError(f"its 'pose' is neither true nor false ({str(pose)[:40]})")
+        return Shape(**numbers, **hidden, activation=activation, pose=pose)
 
     def card(self) -> dict[str, Any]:
         """As it stands on a card."""
         numbers = {k: getattr(self, k) for k in _SIZES}
         hidden = {k: list(getattr(self, k)) for k in _HIDDEN}
-        return {**numbers, "hidden": hidden, "activation": self.activation}
+        return {**numbers, "hidden": hidden, "activation": self.activation, "pose": self.pose}
 
 
 class LatentNets(nn.Module):
@@ -91,14 +97,19 @@ class LatentNets(nn.Module):
         super().__init__()
         s, act = shape, shape.activation
         self.shape = shape
-        z2 = 2 * s.latent
-        self.encoder = MLP(s.obs_size, s.encoder, z2, act, 0.1, generator)  # type: ignore[arg-type]
-        self.prior = MLP(s.self_size, s.prior, z2, act, 0.1, generator)  # type: ignore[arg-type]
+        self.part: PosePart | None = None
+        """See ``see_pose``."""
+        z2, seen = 2 * s.latent, s.obs_size + s.pose * s.action_size
+        self.encoder = MLP(seen, s.encoder, z2, act, HEAD_GAIN, generator)  # type: ignore[arg-type]
+        self.prior = MLP(s.self_size, s.prior, z2, act, HEAD_GAIN, generator)  # type: ignore[arg-type]
         inputs = s.self_size + s.latent
-        self.decoder = MLP(inputs, s.decoder, s.action_size, act, 0.1, generator)  # type: ignore[arg-type]
+        self.decoder = MLP(inputs, s.decoder, s.action_size, act, HEAD_GAIN, generator)  # type: ignore[arg-type]
 
     def posterior(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """(..., D) -> mean and log variance (..., Z) of the latent that follows the goal."""
+        if self.shape.pose:
+            assert self.part is not None
+            obs = torch.cat((obs, self.part.difference(obs).to(obs.dtype)), -1)
         return _split(self.encoder(obs))
 
     def expected(self, body: Tensor) -> tuple[Tensor, Tensor]:
@@ -107,7 +118,16 @@ class LatentNets(nn.Module):
 
     def decode(self, body: Tensor, z: Tensor) -> Tensor:
         """(..., S), (..., Z) -> (..., n) PD targets in units of the body's action scale."""
-        return self.decoder(torch.cat((body, z.to(body.dtype)), -1))
+        action = self.decoder(torch.cat((body, z.to(body.dtype)), -1))
+        assert self.part is not None or not self.shape.pose
+        return action if self.part is None else self.part.pose(body) + action
+
+    def see_pose(self, body: Body, mean: Tensor, std: Tensor) -> None:
+        """Says how observations of a ``body`` were normalised, (D,) or (S,): needed before the
+        first use where ``shape.pose``, without effect elsewhere."""
+        if self.shape.pose:
+            own = proprioception_slices(body.num_links)["body_rot"]
+            self.part = PosePart(body, own, mean, std).to(self.decoder.head.weight.device)
 
 
 def _split(moments: Tensor) -> tuple[Tensor, Tensor]:
@@ -193,6 +213,8 @@ class LatentPrior:
     def digest(self) -> str:
         """sha256 of all that a task's policy depends on: decoder, prior and their normaliser."""
         whole = hashlib.sha256(json.dumps(self.clip).encode())
+        if self.nets.shape.pose:
+            whole.update(b"pose")
         weights = self.nets.state_dict()
         for name in sorted(k for k in weights if not k.startswith("encoder.")):
             whole.update(name.encode() + weights[name].cpu().contiguous().numpy().tobytes())
@@ -242,6 +264,7 @@ def halved(prior: LatentPrior) -> LatentPrior:
         raise PriorError("the weights of the prior do not fit fp16: write it in float32")
     nets.load_state_dict(weights)
     mean, std = prior.mean.cpu(), prior.std.cpu()
+    nets.see_pose(load_body(str(prior.card["body"])), mean, std)
     card = {**prior.card, "precision": "float16"}
     return LatentPrior(nets, mean, std, card, prior.encoder)
 
@@ -353,6 +376,7 @@ def _build(card: dict[str, Any], tensors: dict[str, Tensor], where: str) -> Late
     finite = all(torch.isfinite(x).all() for x in (mean, std, *weights.values()))
     if mean.shape != (size,) or std.shape != (size,) or not finite or (std <= 0).any() or clip <= 0:
         raise PriorError(f"the prior '{where}' holds numbers that are missing or not finite")
+    nets.see_pose(body, mean, std)
     return LatentPrior(nets, mean, std, card, encoder)
 
 

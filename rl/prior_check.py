@@ -20,7 +20,8 @@ from rl import provenance
 from rl.config import TRACKING
 from rl.evaluate import interval
 from rl.host import one_torch_thread
-from rl.latent import ACTIVE, gaussian_kl
+from rl.latent import ACTIVE
+from rl.latent_terms import gaussian_kl
 from rl.policy import Policy, load_policy
 from rl.prior import LatentPrior
 from rl.prior_play import Sampler, play_prior

@@ -169,6 +169,7 @@ def play_prior(
     tables = MotionTables(library, physics.device)
     task = _free(tables, upright_frames(tables), library.body)
     env = Env(task, sampler, physics, seed=seed, training=False)
+    env.own_turns = True
     try:
         check_layout(card["layout"], env.obs_slices)
         prior.to(env.device)

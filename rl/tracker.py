@@ -334,6 +334,7 @@ class TrackingEnv(Env):
         self._digest = bytes.fromhex(library.digest)
         task = self.tracking.task(library.body, steps)
         super().__init__(task, config, physics, seed=seed, training=training and clips is None)
+        self.own_turns = config.action == "absolute"
 
     def assign(self, clips: Sequence[int]) -> None:
         """Says which clip each world plays after the next ``reset``."""

@@ -22,6 +22,7 @@ from sports.registry import get_task, make_config
 from sports.scene import Scene
 from sports.starts import ELAPSED, Starts, Stock, add_noise
 from sports.task import Memory, Task, View, falling_forces, falling_heights
+from sports.turns import nearest_turn
 
 no_autograd = getattr(torch._C, "_AutoDispatchBelowAutograd", contextlib.nullcontext)
 """Nothing in a step has a gradient. Without torch's book-keeping for them its many small operations
@@ -109,6 +110,9 @@ class Env:
             scene.action_offset(), dtype=torch.float32, device=self.device
         )
         """(act,) PD targets of action 0 (rad)."""
+        self.own_turns = False
+        """Take targets on the turn that each joint is on: of a policy that learned rotations, not
+        on which of its two triples of angles a joint stands, which no observation shows."""
         foot = [name.endswith(("Ankle", "Toe")) or name in task.tools for name in body.link_names]
         n = self.num_worlds
         self.age = torch.zeros(n, dtype=torch.long, device=self.device)
@@ -141,9 +145,9 @@ class Env:
         return self.view.curriculum
 
     def act_through(self, layer: ActionLayer | None) -> None:
-        """From now on ``step`` takes the layer's actions, ``action_size`` says how many; None for
-        the athlete's own."""
-        self.layer = layer
+        """From now on ``step`` takes the layer's actions, ``action_size`` says how many, on each
+        joint's own turn; None for the athlete's own."""
+        self.layer, self.own_turns = layer, layer is not None
         self.action_size = self.physics.scene.body.num_dofs if layer is None else layer.size
 
     def reset(self) -> Tensor:
@@ -181,11 +185,17 @@ class Env:
 
     def targets(self, action: Tensor) -> Tensor:
         """(..., act) PD targets (rad) of actions (..., act), which are clipped to [-1, 1]; of a
-        task with its own, actions (N, A, act) of the present state."""
+        task with its own, and with ``own_turns``, actions (N, A, act) of the present state."""
         limited = action.to(torch.float32).clamp(-1.0, 1.0)
         if self.task.targets is not None:
             return self.task.targets(self.view, self.memory, limited)
-        return torch.addcmul(self.action_offset, limited, self.action_scale)
+        targets = torch.addcmul(self.action_offset, limited, self.action_scale)
+        if not self.own_turns:
+            return targets
+        whole = 7 + self.physics.scene.body.num_dofs
+        athletes = self.physics.qpos[:, : self.num_agents * whole]
+        hinges = athletes.unflatten(1, (self.num_agents, whole))[..., 7:]
+        return nearest_turn(targets, hinges)[0]
 
     def _step(self, action: Tensor) -> StepResult:
         ctrl = self.targets(action)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from rl.distillation import DROP, GRACE, TILT, trouble
-from rl.latent import PriorConfig
+from rl.latent_config import PriorConfig
 from rl.tracker import TrackingConfig, TrackingEnv, make_tracking_env
 from sports import quaternion
 from tests.rl.latent_made import golf

@@ -12,21 +12,15 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.distributions import Normal, kl_divergence
 
-from rl.latent import (
-    KEEP,
-    Distiller,
-    FrozenNormalizer,
-    PriorConfig,
-    absolute_action,
-    annealed,
-    gaussian_kl,
-    options_of,
-)
+from rl.latent import KEEP, Distiller, FrozenNormalizer, absolute_action
+from rl.latent_config import PriorConfig, options_of
+from rl.latent_terms import annealed, gaussian_kl, hinge_weights, steered
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError
 from rl.tracker import TrackingConfig, TrackingEnv, make_tracking_env
-from rl.tracking_terms import least_turn, nearest_turn
+from rl.tracking_terms import least_turn
 from sports.physics.base import PhysicsState
+from sports.turns import nearest_turn
 from tests.rl.latent_made import golf
 from tests.warmstart.clips_made import random_clip
 from warmstart.clip import Clip
@@ -43,6 +37,10 @@ SMALL = PriorConfig(
     epochs=2,
     learning_rate=2e-3,
     smooth=0.0,
+    pose=False,
+    stiffness=0.0,
+    nats=(0.0, 0.0),
+    beta=(0.01, 0.001),
 )
 
 
@@ -116,6 +114,55 @@ def test_the_losses_by_hand():
         torch.testing.assert_close(divergence, expected, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(moved, (mean[1:] - KEEP * mean[:-1]).norm(dim=-1))
     env.close()
+
+
+def test_a_new_encoder_says_something_from_the_first_step_on():
+    env = tracking_env(golf())
+    for sigma in (0.22, 1.0):
+        config = dataclasses.replace(SMALL, start_sigma=sigma, encoder=(256, 128))
+        nets = Distiller(env, teacher(env), config).nets
+        obs = torch.randn(500, env.obs_size, generator=torch.Generator().manual_seed(1))
+        with torch.no_grad():
+            mean, logvar = nets.posterior(obs)
+            _, logvar_p = nets.expected(obs[:, :358])
+        torch.testing.assert_close(
+            (0.5 * logvar).exp().mean(), torch.tensor(sigma), rtol=0.05, atol=0
+        )
+        assert float((0.5 * logvar_p).exp().mean()) == pytest.approx(1.0, rel=0.05)
+        assert 0.5 < float(mean.std()) < 2.0
+    env.close()
+
+
+def test_hinges_count_by_the_energy_of_their_springs():
+    stiffness = torch.tensor([800.0, 200.0, 50.0])
+    weight = hinge_weights(stiffness, 0.5)
+    assert float(weight.square().mean()) == pytest.approx(1.0)
+    off = torch.randn(9, 3, generator=torch.Generator().manual_seed(0))
+    energy = 0.5 * (stiffness * off.square()).sum(-1)
+    # The squared norm is the energy, but for one factor.
+    torch.testing.assert_close((weight * off).square().sum(-1), energy * 2.0 / 350.0)
+    assert torch.equal(hinge_weights(stiffness, 0.0), torch.ones(3))
+
+
+def test_beta_is_steered_to_the_divergence_that_was_asked_for():
+    beta = torch.tensor(1e-3)
+    assert torch.equal(steered(beta, torch.tensor(20.0), 20.0, 0.1), beta)
+    assert float(steered(beta, torch.tensor(30.0), 20.0, 0.1)) == pytest.approx(
+        1e-3 * math.exp(0.05)
+    )
+    assert float(steered(beta, torch.tensor(900.0), 20.0, 0.1)) == pytest.approx(
+        1e-3 * math.exp(0.1)
+    )
+    assert float(steered(beta, torch.tensor(0.0), 20.0, 0.1)) == pytest.approx(
+        1e-3 * math.exp(-0.1)
+    )
+    # A Gaussian channel of Z dimensions, unit signals and noise s^2 = beta: 0.5 Z log(1 + 1 / s^2)
+    # nats. It is led to where that is what was asked for.
+    for _ in range(300):
+        nats = 16.0 * torch.log1p(1.0 / beta)
+        beta = steered(beta, nats, 48.0, 0.1)
+    assert float(beta) == pytest.approx(1.0 / (math.exp(3.0) - 1.0), rel=1e-3)
+    assert float(steered(torch.tensor(0.1), torch.tensor(99.0), 20.0, 0.1)) == pytest.approx(0.1)
 
 
 # PD targets.
@@ -236,6 +283,36 @@ def test_acting_labels_with_the_teacher_and_disturbs_some_worlds():
     env.close()
 
 
+def test_some_worlds_act_by_the_prior_alone():
+    env = tracking_env(golf(), worlds=8)
+    config = dataclasses.replace(SMALL, noise=0.0, alone=0.5)
+    learner = Distiller(env, teacher(env), config, seed=4)
+    obs = env.reset()[:, 0]
+    goal = obs.clone()
+    goal[:, 358:] *= -1.0
+    actions = []
+    for seen in (obs, goal):
+        learner.generator.manual_seed(7)
+        stored, action, label, _ = learner.act(seen)
+        actions.append(action)
+        torch.testing.assert_close(label, absolute_action(env, learner._teacher(stored)))
+    # What the goal shows moves those that follow it alone.
+    assert torch.equal(actions[0][4:], actions[1][4:])
+    assert float((actions[0] - actions[1])[:4].abs().amax(-1).min()) > 1e-4
+    # Draws of the prior: as many as it takes give its decoded mean and spread.
+    draws = torch.stack([learner.act(obs)[1][4:] for _ in range(400)])
+    with torch.no_grad():
+        stored = learner.prepare(obs)[4:, :358]
+        mean, logvar = learner.nets.expected(stored)
+        noise = torch.randn(2000, 4, 8, generator=torch.Generator().manual_seed(0))
+        wanted = learner.nets.decode(
+            stored.expand(2000, -1, -1), mean + (0.5 * logvar).exp() * noise
+        )
+    torch.testing.assert_close(draws.mean(0), wanted.mean(0), atol=0.02, rtol=0)
+    torch.testing.assert_close(draws.std(0).mean(), wanted.std(0).mean(), rtol=0.1, atol=0)
+    env.close()
+
+
 def filled(learner: Distiller, obs: torch.Tensor, label: torch.Tensor):
     rollout = learner.new_rollout(obs.shape[1])
     rollout.obs.copy_(obs)
@@ -285,6 +362,39 @@ def test_what_the_body_tells_needs_no_latent():
     assert taught(goal=True, beta=0.05)[1]["kl"] > 0.5
 
 
+def faint(config: PriorConfig, updates: int) -> dict[str, float]:
+    """Last statistics of a student whose teacher does mostly what the body tells, and a little that
+    only the goal does: six directions of 0.05 beside six of 0.3."""
+    env = tracking_env(golf())
+    learner = Distiller(env, teacher(env), config)
+    learner.obs_norm = FrozenNormalizer(torch.zeros(934), torch.ones(934), 5.0, 1.0)
+    g = torch.Generator().manual_seed(0)
+    directions = torch.linalg.qr(torch.randn(69, 12, generator=g))[0].T
+    told = {}
+    for i in range(updates):
+        learner.schedule(i / updates)
+        obs = torch.zeros(4, 64, 934)
+        obs[..., :6] = torch.randn(4, 64, 6, generator=g)
+        obs[..., 358:364] = torch.randn(4, 64, 6, generator=g)
+        label = 0.3 * torch.tanh(obs[..., :6]) @ directions[:6]
+        label = label + 0.05 * torch.tanh(obs[..., 358:364]) @ directions[6:]
+        told = {k: float(v) for k, v in learner.update(filled(learner, obs, label)).items()}
+    env.close()
+    return told
+
+
+def test_latents_that_collapsed_stay_awake():
+    """With the settings of PULSE nothing of the goal comes through: the posterior is noise before
+    the decoder has a use for it. With a divergence that is kept up it does."""
+    pulse = dataclasses.replace(SMALL, start_sigma=1.0, smooth=0.005, learning_rate=5e-4)
+    steered_ = dataclasses.replace(SMALL, smooth=0.0005, nats=(20.0, 8.0), beta=(1e-4, 1e-3))
+    before, now = faint(pulse, 150), faint(steered_, 150)
+    # What only the goal tells is 0.08 in the mean.
+    assert before["kl"] < 0.5 and before["active"] <= 2
+    assert 6.0 < now["kl"] < 10.0 and now["active"] >= 6
+    assert now["action_error"] < 0.8 * before["action_error"]
+
+
 def test_steps_across_a_reset_and_broken_worlds_teach_nothing():
     env = tracking_env(golf())
     losses, weights = [], []
@@ -318,9 +428,10 @@ def test_states_go_round():
     env = tracking_env(golf())
     obs = torch.randn(4, 8, 934, generator=torch.Generator().manual_seed(1))
     label = torch.randn(4, 8, 69, generator=torch.Generator().manual_seed(2)) * 0.2
-    one = Distiller(env, teacher(env), SMALL)
+    config = dataclasses.replace(SMALL, nats=(20.0, 8.0), pose=True, stiffness=0.5)
+    one = Distiller(env, teacher(env), config)
     one.update(filled(one, obs, label))
-    two = Distiller(env, teacher(env), SMALL, seed=9)
+    two = Distiller(env, teacher(env), config, seed=9)
     two.load_state_dict({k: v.clone() for k, v in one.state_dict().items()})
     told = [x.update(filled(x, obs, label)) for x in (one, two)]
     for name, value in told[0].items():
@@ -336,6 +447,10 @@ def test_states_go_round():
 def test_settings_that_cannot_be_are_refused():
     for wrong, words in (
         ({"latent": 0}, "at least 1"),
+        ({"nats": (20.0, 0.0)}, "0 0 for a beta that is not steered"),
+        ({"stiffness": -0.5}, "must not be negative"),
+        ({"nats_share": 0.0}, "nats_share in"),
+        ({"start_sigma": 0.0}, "must be positive"),
         ({"beta": (0.01, 0.0)}, "must be positive"),
         ({"fallen": 1.5}, r"lie in \[0, 1\]"),
         ({"push": -1.0}, "not be negative"),

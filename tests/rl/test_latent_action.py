@@ -47,6 +47,7 @@ def test_acting_through_the_layer_is_decoding_by_hand():
     one, two = (make_env("penalty_kick", num_worlds=4, seed=3) for _ in range(2))
     one.act_through(layer_of(one, prior))
     assert one.action_size == 6 and two.action_size == 69
+    two.own_turns = True  # as an environment with a layer does
     first, obs = one.reset(), two.reset()
     assert torch.equal(first, obs)
     g = torch.Generator().manual_seed(0)

@@ -6,8 +6,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from rl.latent import Distiller, PriorConfig
+from rl.latent import Distiller
 from rl.latent_action import LatentActions, LatentConfig
+from rl.latent_config import PriorConfig
 from rl.networks import MLP
 from rl.policy import Policy
 from rl.tracker import TrackingConfig, TrackingEnv, make_tracking_env
