@@ -136,9 +136,10 @@ def write_result(config: Track, options: Any, entries: list[Any], figures: dict[
     assert config.result is not None
     cut = "" if config.seconds is None else f" --seconds {config.seconds:g}"
     start = f" --start {config.start:g}" if config.start else ""
-    words = f"--strength {options.strength} --worlds {config.worlds} --seed {config.seed}"
     if options.player:
         words = f"--tracker {Path(config.tracker).name}"
+    else:
+        words = f"--strength {options.strength} --worlds {config.worlds} --seed {config.seed}"
     value = {
         "command": f"olympics-opt mocap track {config.clips.name} {words}{start}{cut}",
         "strength": options.strength,

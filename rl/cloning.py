@@ -27,6 +27,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from rl.annealing import annealed
 from rl.ppo import PPO, gaussian_log_prob
 from rl.rollout import Rollout
 from sports.humanoid.body import is_finger
@@ -134,12 +135,12 @@ class Cloning:
     def update(self, rollout: Rollout, done: int) -> dict[str, Tensor]:
         """Learns the labels of a rollout; ``done`` iterations were before. After its turn PPO has
         learned those of the fingers. Returns the error before either learned from them."""
-        c, share = self.agent.config, min(done / max(self.iterations, 1), 1.0)
+        c = self.agent.config
         if not self.leading:
             off = (rollout.mean - self._kept)[..., self.fingers].square().mean(-1)
             weight = rollout.valid.float()
             return {STATISTIC: ((weight * off).sum() / weight.sum().clamp(min=1.0)).sqrt()}
-        self.rate.fill_(RATES[0] * (RATES[1] / RATES[0]) ** share)
+        self.rate.fill_(annealed(*RATES, done / max(self.iterations, 1)))
         obs, label = rollout.obs.flatten(0, 1), rollout.mean.flatten(0, 1)
         weight = rollout.valid.flatten().float()
         error, size = torch.zeros((), device=self.device), len(obs)

@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from rl.config import TRACKING
 from rl.host import one_torch_thread
 from rl.policy import Policy, load_policy
 from rl.tracker import make_tracking_env
-from rl.tracker_evaluation import TRACKING, tracking_config
+from rl.tracker_evaluation import tracking_config
 from warmstart.clip import Clip
 from warmstart.library import pack
 

@@ -17,19 +17,14 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from rl.annealing import annealed
 from rl.graph import GraphedStep
 from rl.latent_config import PriorConfig
-from rl.latent_terms import annealed, awaken, gaussian_kl, hinge_weights, steered
+from rl.latent_terms import awaken, gaussian_kl, hinge_weights, steered
 from rl.learned import learned_state, load_learned
 from rl.networks import autocast
 from rl.policy import Policy
-from rl.prior import (
-    FORMAT,
-    LatentNets,
-    body_digest,
-    check_layout,
-    self_layout,
-)
+from rl.prior import FORMAT, LatentNets, body_digest, check_layout, self_layout
 from rl.ranks import SharedGradients, SharedStep, own_rank
 from rl.rollout import Rollout
 from rl.tracker import TrackingEnv

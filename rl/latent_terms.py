@@ -23,11 +23,6 @@ def gaussian_kl(mean: Tensor, logvar: Tensor, mean_p: Tensor, logvar_p: Tensor) 
     return 0.5 * (logvar_p - logvar + apart - 1.0)
 
 
-def annealed(first: float, last: float, share: float) -> float:
-    """From first to last, geometrically, as ``share`` goes from 0 to 1."""
-    return first * (last / first) ** min(max(share, 0.0), 1.0)
-
-
 def awaken(nets: LatentNets, sigma: float) -> None:
     """Prepares new networks for latents that carry something from the first step on: posterior
     means of unit size, posteriors of width ``sigma``, the prior near a unit Gaussian.

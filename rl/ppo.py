@@ -16,6 +16,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from rl.annealing import annealed
 from rl.graph import GraphedStep
 from rl.learned import learned_state, load_learned
 from rl.networks import MLP, Activation, autocast
@@ -225,10 +226,10 @@ class PPO:
         """Sets sigma and the KL band for the part of the run that is done, 0..1."""
         c = self.config
         if c.kl_band is not None and c.kl_band_final is not None:
-            for i, (first, last) in enumerate(zip(c.kl_band, c.kl_band_final)):
-                self.kl_band[i] = first * (last / first) ** share
+            for i, ends in enumerate(zip(c.kl_band, c.kl_band_final)):
+                self.kl_band[i] = annealed(*ends, share)
         if c.sigma_final is not None:
-            self.sigma.fill_(c.sigma * (c.sigma_final / c.sigma) ** share)
+            self.sigma.fill_(annealed(c.sigma, c.sigma_final, share))
 
     # -- acting ---------------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from rl.annealing import annealed
 from rl.clip_sampling import ClipSampling
 from rl.motion import MotionTables, Reference
 from rl.tracking_terms import (
@@ -129,8 +130,7 @@ class Tracking:
         x = min(share / self.config.curriculum_share, 1.0)
         first, last = self._ends
         self.sharpness.copy_(first * (last / first) ** x)
-        begin, end = self.config.tolerance
-        self.tolerance.fill_(begin * (end / begin) ** x)
+        self.tolerance.fill_(annealed(*self.config.tolerance, x))
 
     def targets(self, view: View, memory: Memory, action: Tensor) -> Tensor:
         """(N, 1, n) PD targets (rad) of actions in [-1, 1] around the next frame's pose."""

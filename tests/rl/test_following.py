@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from olympics_opt import cli
 from rl.following import Follower
 from rl.policy import PolicyError
 from sports.humanoid.body import load_body
-from sports.physics import PhysicsState, make_physics
-from sports.scene import humanoid_scene
+from tests.warmstart.replayed import next_states
 from warmstart.bank import demonstration_files
 from warmstart.clip import Clip
 from warmstart.correction import correct, joint_errors
@@ -37,19 +35,8 @@ def test_every_frame_follows_from_the_one_before(follower, stroke):
     """The PD targets, put into the engine again state by state, lead to the next state."""
     played = follower(stroke, 0.3)
     assert played.num_frames == stroke.num_frames and played.ctrl is not None
-    scene = humanoid_scene(load_body("smpl", strength=follower.strength))
-    worlds = played.num_frames - 1
-    physics = make_physics("mujoco", scene, worlds)
-    state = PhysicsState(
-        torch.tensor(np.float32(played.qpos[:-1])),
-        torch.tensor(np.float32(played.qvel[:-1])),
-        torch.zeros(worlds, 0, 3),
-    )
-    physics.reset(torch.ones(worlds, dtype=torch.bool), state)
-    physics.step(torch.tensor(np.float32(played.ctrl[:-1])))
-    # Contact forces start cold here: they agree to the solver's tolerance only.
-    assert np.abs(physics.qpos.numpy() - played.qpos[1:]).max() < 2e-3
-    physics.close()
+    body = load_body("smpl", strength=follower.strength)
+    assert np.abs(next_states(played, body) - played.qpos[1:]).max() < 2e-3
 
 
 def test_it_stays_with_a_stroke_wherever_that_is_played(follower, stroke):

@@ -12,9 +12,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.distributions import Normal, kl_divergence
 
+from rl.annealing import annealed
 from rl.latent import KEEP, Distiller, FrozenNormalizer, absolute_action
 from rl.latent_config import PriorConfig, options_of
-from rl.latent_terms import annealed, gaussian_kl, hinge_weights, steered
+from rl.latent_terms import gaussian_kl, hinge_weights, steered
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError
 from rl.tracker import TrackingConfig, TrackingEnv, make_tracking_env
