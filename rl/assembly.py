@@ -16,7 +16,15 @@ from torch import Tensor
 
 from rl import latent_run
 from rl.checkpoint import checkpoints
-from rl.config import PRIOR, TRACKING, TrainConfig, load_placed_starts, load_starts
+from rl.config import (
+    APART,
+    BALANCE,
+    PRIOR,
+    TRACKING,
+    TrainConfig,
+    load_placed_starts,
+    load_starts,
+)
 from rl.host import local_ranks, pick_device
 from rl.meter import EpisodeMeter
 from rl.parts import ImitationReward, Impacts, Lesson, Opponents, Part, Style
@@ -168,6 +176,10 @@ def default_env(config: TrainConfig, seed: int) -> Env:
         from rl.distillation import make_distillation_env
 
         return make_distillation_env(config, seed, physics_options)
+    if config.task == BALANCE:
+        from rl.balance import make_balance_env
+
+        return make_balance_env(config, seed, physics_options)
     if config.task == TRACKING:
         from rl.tracker import TrackingConfig, make_tracking_env
 
@@ -198,7 +210,7 @@ def default_env(config: TrainConfig, seed: int) -> Env:
 
 def _starts_of_clips(config: TrainConfig) -> Starts | None:
     """Frames of the clips, where they are demonstrations of the task and not motions to follow."""
-    if not config.clips or config.task in (TRACKING, PRIOR):
+    if not config.clips or config.task in APART:
         return None
     load = load_placed_starts if config.styled else load_starts
     return load(config.clips, config.start_probability[0])

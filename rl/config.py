@@ -23,6 +23,10 @@ TRACKING = "tracking"
 """The task of the motion tracker. It is not in the registry: it is nothing without clips."""
 PRIOR = "prior"
 """The distillation of the tracker into a latent prior: not a sport either."""
+BALANCE = "balance"
+"""Where a latent prior learns to stay on its feet."""
+APART = (TRACKING, PRIOR, BALANCE)
+"""Tasks beside the registry: those that need clips."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,8 @@ class TrainConfig:
     tracker: str | None = None
     """For the task ``prior``: the motion tracker to learn from, a run or a policy file."""
     prior: str | None = None
-    """Act through this latent prior: a run of the task ``prior``, a file, or pretrained."""
+    """Act through this latent prior: a run of the task ``prior`` or ``balance``, a file, or
+    pretrained."""
     latent: LatentConfig = field(default_factory=LatentConfig)
     """How, with ``--prior``."""
     start_probability: tuple[float, float] = (0.5, 0.1)
@@ -133,7 +138,9 @@ class TrainConfig:
     @property
     def hyper(self) -> PPOConfig:
         """The hyper-parameters in force."""
-        return PAPER if self.paper else self.ppo
+        ppo = PAPER if self.paper else self.ppo
+        # The noise of ``balance`` is the prior's own.
+        return replace(ppo, sigma=1.0, sigma_final=None) if self.task == BALANCE else ppo
 
     @property
     def styled(self) -> bool:
@@ -184,6 +191,11 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
     if c.styled and c.task == TRACKING:
         yield "the tracker follows its clips frame by frame: leave --algo amp out"
 
+    if c.task == BALANCE:
+        if c.prior is None:
+            yield "balance is learned by a latent prior: give --prior"
+        if c.algo != "ppo" or c.init or c.clone or c.latent != LatentConfig():
+            yield "balance is ppo on the prior as it plays: leave --algo, --init, --latent out"
     if c.prior is None and (c.algo.startswith("latent") or c.latent != LatentConfig()):
         yield "--algo latent and the --latent options need --prior"
     if c.prior is not None and c.task in (TRACKING, PRIOR):
@@ -207,6 +219,10 @@ def task_options(task: str) -> type:
         from rl.tracker import TrackingConfig
 
         return TrackingConfig
+    if task == BALANCE:
+        from rl.balance import BalanceConfig
+
+        return BalanceConfig
     return get_task(task).config
 
 
@@ -257,7 +273,7 @@ def parse_args(args: list[str], prog: str = "python -m rl.train") -> TrainConfig
 
     Raises ValueError for an unknown task; exits with code 2 and a message for other mistakes.
     """
-    known = ", ".join((*task_names(), TRACKING, PRIOR))
+    known = ", ".join((*task_names(), *APART))
     if not args or args[0].startswith("-"):
         if not {"-h", "--help"} & set(args):
             raise ValueError(f"say which task to train: {known}")

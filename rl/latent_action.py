@@ -23,11 +23,12 @@ from sports.scene import Scene
 class LatentConfig:
     """How a policy acts through a latent prior (``--prior``)."""
 
-    combine: Literal["bounded", "free"] = "bounded"
+    combine: Literal["bounded", "scaled", "free"] = "bounded"
     """bounded: z = mu + sigma x ``span`` x tanh(a) with the prior's mu and sigma in the present
-    state, which keeps the policy human; free: z = mu + a, as in the PULSE paper."""
+    state, which keeps the policy human; scaled: the same without the tanh; free: z = mu + a, as in
+    the PULSE paper."""
     span: float = 2.5
-    """Standard deviations of the prior that a bounded policy reaches."""
+    """Standard deviations of the prior that a bounded policy reaches, and a scaled one by a = 1."""
     arm_residual: float = 0.0
     """Radians that the policy may add to the targets of the arm that holds the tool; 0 for none.
     0.2 helps in racket sports."""
@@ -110,7 +111,8 @@ class LatentActions:
         a = action[..., : self.prior.latent].float()
         if self.config.combine == "free":
             return mean + a
-        return mean + sigma * self.config.span * torch.tanh(a)
+        reach = a if self.config.combine == "scaled" else torch.tanh(a)
+        return mean + sigma * self.config.span * reach
 
     @torch.no_grad()
     def __call__(self, obs: Tensor, action: Tensor) -> Tensor:

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 
 from rl.checkpoint import checkpoints, read_state
-from rl.config import TrainConfig
+from rl.config import BALANCE, TrainConfig
 from rl.latent import Distiller
-from rl.latent_action import LatentActions
+from rl.latent_action import LatentActions, LatentConfig
 from rl.prior import FILE, LatentPrior, PriorError, load_prior, read_card, save_prior
 
 
@@ -45,7 +45,8 @@ def act_through_prior(env: Any, config: TrainConfig) -> None:
                 f"the run {config.out} acts through the prior {str(wanted)[:12]}..., not "
                 f"{prior.digest[:12]}...: give that one"
             )
-    layer = LatentActions(prior, config.latent, env.physics.scene, env.task.tools, env.device)
+    how = LatentConfig("scaled", span=1.0) if config.task == BALANCE else config.latent
+    layer = LatentActions(prior, how, env.physics.scene, env.task.tools, env.device)
     layer.check(env.obs_slices)
     env.act_through(layer)
 

@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +28,7 @@ from rl import pretrained
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.networks import MLP
 from rl.prior_pose import PosePart
+from rl.steady import Steady
 from sports.frames import proprioception_slices
 from sports.humanoid.body import Body, load_body
 from warmstart.atomic import write_bytes, write_text
@@ -42,6 +44,7 @@ HEAD_GAIN = 0.1  # of the networks' last layers at first
 _SIZES = ("obs_size", "self_size", "action_size", "latent")
 _HIDDEN = ("encoder", "prior", "decoder")
 MAX_WIDTH, MAX_LAYERS = 1 << 16, 64
+_STEADY = "steady."
 
 
 class PriorError(ValueError):
@@ -164,7 +167,13 @@ class LatentPrior:
     """Frozen networks with their normaliser. Observations are raw; everything in float32."""
 
     def __init__(
-        self, nets: LatentNets, mean: Tensor, std: Tensor, card: dict[str, Any], encoder: bool
+        self,
+        nets: LatentNets,
+        mean: Tensor,
+        std: Tensor,
+        card: dict[str, Any],
+        encoder: bool,
+        steady: Steady | None = None,
     ) -> None:
         """Args:
         nets: the networks; they are frozen here.
@@ -172,6 +181,7 @@ class LatentPrior:
         std: likewise.
         card: see ``save_prior``.
         encoder: whether ``nets`` has one that learned.
+        steady: what moves the prior's mean so that it stays on its feet, if it has learned to.
         """
         self.nets = nets.float().requires_grad_(False)
         self.mean, self.std, self.card, self.encoder = mean, std, card, encoder
@@ -179,11 +189,14 @@ class LatentPrior:
         self.size = nets.shape.self_size
         """S, numbers of the athlete's own body, the first of every observation."""
         self.latent = nets.shape.latent
+        self.steady = steady
 
     def to(self, device: torch.device | str) -> LatentPrior:
         """The same on a device (moved in place)."""
         self.nets.to(device)
         self.mean, self.std = self.mean.to(device), self.std.to(device)
+        if self.steady is not None:
+            self.steady.to(device)
         return self
 
     def _normalized(self, obs: Tensor, size: int) -> Tensor:
@@ -194,7 +207,10 @@ class LatentPrior:
     def moments(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """(..., D >= S) observations -> mean and standard deviation (..., Z) of the prior."""
         mean, logvar = self.nets.expected(self._normalized(obs, self.size))
-        return mean, (0.5 * logvar).exp()
+        sigma = (0.5 * logvar).exp()
+        if self.steady is not None:
+            mean = mean + sigma * self.steady(obs[..., : self.size])
+        return mean, sigma
 
     @torch.no_grad()
     def posterior(self, obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -220,6 +236,10 @@ class LatentPrior:
             whole.update(name.encode() + weights[name].cpu().contiguous().numpy().tobytes())
         for row in (self.mean, self.std):
             whole.update(row[: self.size].cpu().contiguous().numpy().tobytes())
+        if self.steady is not None:
+            whole.update(json.dumps(self.steady.card()).encode())
+            for name, value in sorted(self.steady.state_dict().items()):
+                whole.update(name.encode() + value.cpu().contiguous().numpy().tobytes())
         return whole.hexdigest()
 
 
@@ -238,12 +258,16 @@ def save_prior(prior: LatentPrior, out: Path | str, *, half: bool, encoder: bool
         prior = halved(prior)
     keep = encoder and prior.encoder
     weights = {k: v for k, v in prior.nets.state_dict().items() if keep or "encoder" not in k}
+    if prior.steady is not None:
+        weights |= {f"{_STEADY}{k}": v for k, v in prior.steady.net.state_dict().items()}
     kind = torch.float16 if half else torch.float32
     tensors = {k: v.detach().cpu().to(kind).contiguous() for k, v in weights.items()}
     size = prior.nets.shape.obs_size if keep else prior.size
     for name in ("mean", "std"):
         row = getattr(prior, name)[:size]
         tensors[f"normalizer.{name}"] = row.detach().float().cpu().contiguous().clone()
+        if prior.steady is not None:
+            tensors[f"{_STEADY}{name}"] = getattr(prior.steady, name).cpu().contiguous()
     data = save(tensors)
     digest = hashlib.sha256(data).hexdigest()
     precision = "float16" if half else "float32"
@@ -266,7 +290,11 @@ def halved(prior: LatentPrior) -> LatentPrior:
     mean, std = prior.mean.cpu(), prior.std.cpu()
     nets.see_pose(load_body(str(prior.card["body"])), mean, std)
     card = {**prior.card, "precision": "float16"}
-    return LatentPrior(nets, mean, std, card, prior.encoder)
+    steady = prior.steady
+    if steady is not None:
+        steady = deepcopy(steady).cpu()
+        steady.net.half().float()
+    return LatentPrior(nets, mean, std, card, prior.encoder, steady)
 
 
 def load_prior(source: str | Path) -> LatentPrior:
@@ -330,6 +358,10 @@ def _from_run(run: Path) -> LatentPrior:
         card = dict(state["card"])
     except (CheckpointError, KeyError, TypeError, ValueError) as error:
         raise PriorError(f"the run '{run}' cannot be used: {error}") from error
+    if card.get("task") == "balance":
+        from rl.balance import steadied
+
+        return halved(steadied(run))
     if card.get("format") != FORMAT:
         raise PriorError(
             f"the run '{run}' is of task '{card.get('task')}', not of 'prior': it holds no prior"
@@ -360,7 +392,8 @@ def _build(card: dict[str, Any], tensors: dict[str, Tensor], where: str) -> Late
             f"the prior '{where}' sees its body in another layout than this version shows it: "
             "distil it again"
         )
-    weights = {k: v.float() for k, v in tensors.items() if not k.startswith("normalizer.")}
+    others = ("normalizer.", _STEADY)
+    weights = {k: v.float() for k, v in tensors.items() if not k.startswith(others)}
     encoder = any(k.startswith("encoder.") for k in weights)
     if not encoder:
         empty = nets.encoder.state_dict()
@@ -369,6 +402,7 @@ def _build(card: dict[str, Any], tensors: dict[str, Tensor], where: str) -> Late
         nets.load_state_dict(weights, assign=True)
         mean, std = tensors["normalizer.mean"].float(), tensors["normalizer.std"].float()
         clip = float(card["observation_clip"])
+        steady = _build_steady(card, tensors, shape)
     except (RuntimeError, KeyError, TypeError, ValueError) as error:
         why = " ".join(str(error).split())
         raise PriorError(f"the weights of prior '{where}' do not fit its card: {why}") from None
@@ -377,7 +411,23 @@ def _build(card: dict[str, Any], tensors: dict[str, Tensor], where: str) -> Late
     if mean.shape != (size,) or std.shape != (size,) or not finite or (std <= 0).any() or clip <= 0:
         raise PriorError(f"the prior '{where}' holds numbers that are missing or not finite")
     nets.see_pose(body, mean, std)
-    return LatentPrior(nets, mean, std, card, encoder)
+    return LatentPrior(nets, mean, std, card, encoder, steady)
+
+
+def _build_steady(card: dict[str, Any], tensors: dict[str, Tensor], shape: Shape) -> Steady | None:
+    """Raises ValueError, KeyError or RuntimeError where card and weights do not fit."""
+    own = {k[len(_STEADY) :]: v.float() for k, v in tensors.items() if k.startswith(_STEADY)}
+    if ("steady" in card) != bool(own):
+        raise ValueError("its card and its weights differ on whether it has learned to balance")
+    if not own:
+        return None
+    steady = Steady.of(card["steady"], shape.self_size, shape.latent)
+    rows = {name: own.pop(name) for name in ("mean", "std")}
+    steady.load_state_dict({f"net.{k}": v for k, v in own.items()} | rows)
+    finite = all(torch.isfinite(x).all() for x in steady.state_dict().values())
+    if not finite or (steady.std <= 0).any():
+        raise ValueError("its 'steady' part holds numbers that are not finite")
+    return steady
 
 
 def find_prior(digest: str, near: Iterable[Path]) -> LatentPrior:

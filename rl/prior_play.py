@@ -98,7 +98,7 @@ def upright_frames(tables: MotionTables) -> Tensor:
     return found
 
 
-def _free(tables: MotionTables, frames: Tensor, body: str) -> Task:
+def free_task(tables: MotionTables, frames: Tensor, body: str) -> Task:
     """An athlete alone, who begins in one of the ``frames``; nothing ends an episode."""
 
     def start(
@@ -167,7 +167,7 @@ def play_prior(
         raise ValueError(f"the prior is of body '{card['body']}', the clips of '{library.body}'")
     physics = make_physics(engine, humanoid_scene(body), num_worlds, **(physics_options or {}))
     tables = MotionTables(library, physics.device)
-    task = _free(tables, upright_frames(tables), library.body)
+    task = free_task(tables, upright_frames(tables), library.body)
     env = Env(task, sampler, physics, seed=seed, training=False)
     env.own_turns = True
     try:

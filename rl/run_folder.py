@@ -18,7 +18,7 @@ from torch import Tensor
 from rl import latent_run, provenance
 from rl.assembly import Assembly
 from rl.checkpoint import checkpoints, load_checkpoint, ranks_of, read_state, save_checkpoint
-from rl.config import PRIOR, TRACKING, TrainConfig, config_from_dict, task_options
+from rl.config import APART, TrainConfig, config_from_dict, task_options
 from rl.policy import FORMAT as POLICY_FORMAT
 from sports.registry import task_names
 from warmstart.atomic import write_text
@@ -62,9 +62,11 @@ def settle(config: TrainConfig) -> TrainConfig:
     if not saved:
         return config
     stored = config_from_dict(read_state(saved[-1])["card"]["config"])
-    plain = TrainConfig(task=config.task)
+    plain = TrainConfig()
     changes = {}
     for f in dataclasses.fields(TrainConfig):
+        if f.name == "task":
+            continue
         given, own = getattr(config, f.name), getattr(stored, f.name)
         asked = given != getattr(plain, f.name)
         if f.name == "options":
@@ -88,7 +90,7 @@ def _same_options(task: str, given: dict[str, Any], own: dict[str, Any]) -> None
     The command line gives every option of the task, asked for or not, so that one at its default
     asks for nothing; lists are what JSON made of the run's tuples.
     """
-    known = (*task_names(), TRACKING, PRIOR)
+    known = (*task_names(), *APART)
     plain = dataclasses.asdict(task_options(task)()) if task in known else {}
     for name, value in given.items():
         asked = json.loads(json.dumps(value))
