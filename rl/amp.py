@@ -52,6 +52,10 @@ class AMPConfig:
     """Of the discriminator (Adam), constant."""
     steps: int = 8
     """Gradient steps of the discriminator per iteration."""
+    ceiling: float = 0.95
+    """Shares of windows, of the agent's and of the demonstrations', above both of which the
+    discriminator is right often enough: it learns nothing from that batch. One that is always right
+    pays nothing for moving a little more like the demonstrations. 1 for no ceiling."""
     batch: int = 2048
     """Windows of the rollout, of the replay and of the demonstrations in a step, each."""
     gradient_penalty: float = 5.0
@@ -72,6 +76,8 @@ class AMPConfig:
             raise ValueError("amp: style, learning_rate and gradient_penalty must not be negative")
         if min(self.logit_decay, self.weight_decay) < 0.0:
             raise ValueError("amp: logit_decay and weight_decay must not be negative")
+        if not 0.5 < self.ceiling <= 1.0:
+            raise ValueError(f"amp: ceiling must lie in (0.5, 1], not {self.ceiling}")
         if not 0.0 <= self.optimised_share <= 1.0 or not 0.0 < self.replay_share <= 1.0:
             raise ValueError("amp: optimised_share must lie in [0, 1], replay_share in (0, 1]")
 
@@ -297,7 +303,11 @@ class AMP:
             + c.weight_decay * decay
         )
         # Without a single window of the agent there is nothing to tell apart yet.
-        loss = loss * (weight.sum() > 0.0)
+        learns = weight.sum() > 0.0
+        if c.ceiling < 1.0:
+            worse = torch.minimum(losses.accuracy_agent, losses.accuracy_demonstration)
+            learns = learns & (worse <= c.ceiling)
+        loss = loss * learns
         loss.backward()
         with torch.no_grad():
             accuracies = (losses.accuracy_agent, losses.accuracy_demonstration)

@@ -194,8 +194,8 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
     if c.task == BALANCE:
         if c.prior is None:
             yield "balance is learned by a latent prior: give --prior"
-        if c.algo != "ppo" or c.init or c.clone or c.latent != LatentConfig():
-            yield "balance is ppo on the prior as it plays: leave --algo, --init, --latent out"
+        if c.algo != "ppo" or c.clone or c.latent != LatentConfig():
+            yield "balance is ppo on the prior as it plays: leave --algo, --clone, --latent out"
     if c.prior is None and (c.algo.startswith("latent") or c.latent != LatentConfig()):
         yield "--algo latent and the --latent options need --prior"
     if c.prior is not None and c.task in (TRACKING, PRIOR):

@@ -129,7 +129,7 @@ def test_mistakes_are_told(folder, tmp_path):
     with pytest.raises(ValueError, match="strength 'paper'"):
         train(run_config(folder, strength="human", out=tmp_path / "b"))
     with pytest.raises(ValueError, match="leave --algo"):
-        run_config(folder, init="pretrained")
+        run_config(folder, algo="amp")
     with pytest.raises(ValueError, match="seconds"):
         BalanceConfig(seconds=0.0)
     with pytest.raises(PriorError, match="learned to balance already"):

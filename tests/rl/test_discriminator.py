@@ -117,6 +117,35 @@ def test_two_gaussians_reach_the_optimum_of_the_closed_form():
         assert right == pytest.approx(stats.norm.cdf(0.5), abs=0.03)
 
 
+@pytest.mark.parametrize("ceiling, least", [(0.9, 0.3), (1.0, 0.0)])
+def test_a_discriminator_below_its_ceiling_leaves_something_to_be_paid(ceiling, least):
+    """Agent N(0, 1), demonstrations N(6, 1): all can be told apart. Without a ceiling the reward
+    of the agent goes to nothing; with one the net stops where it is right often enough, where a
+    logit of a few units is what it takes, and the demonstrations' side still looks better."""
+    g = torch.Generator().manual_seed(3)
+    shown = torch.randn(5000, 1, generator=g) + 6.0
+    plain = {"gradient_penalty": 0.0, "logit_decay": 0.0, "weight_decay": 0.0, "frames": 1}
+    plain |= {"hidden": (32,), "batch": 512, "steps": 20, "replay": 4096, "learning_rate": 1e-3}
+    config = AMPConfig(**plain, replay_share=1.0, ceiling=ceiling)
+    source = Draws(256, 1, seed=4)
+    kinds = torch.ones(len(shown), dtype=torch.bool)
+    amp = AMP(source, Demonstrations(shown, torch.arange(5000), kinds), 256, 8, config, seed=0)
+    rollout = PPO(1, 1, PPOConfig(hidden=(4,), steps=8)).new_rollout(256)
+    statistics = {}
+    for _ in range(40):
+        for _ in range(8):
+            source.draw()
+            amp.watch(step_result(256, 1))
+        amp.pay(rollout, 1.0)
+        statistics = amp.update()
+    paid = float(statistics["style/reward"])
+    assert paid >= least and (least or paid < 0.02)
+    with torch.no_grad():
+        x = torch.tensor([[0.0], [6.0]])
+        agent, demonstration = amp.net(amp.norm.normalize(x)).squeeze(-1).tolist()
+    assert agent < demonstration
+
+
 def test_replay_keeps_the_newest_and_draws_each_alike():
     replay = Replay(
         windows=20, steps=4, frames=3, size=1, device=torch.device("cpu"), dtype=torch.float32
