@@ -44,6 +44,8 @@ TARGET_LOW, TARGET_HIGH = (HALF_LENGTH, -1.8, 0.2), (HALF_LENGTH, 1.8, 1.8)
 SUCCESS_DISTANCE = 0.5
 SECOND_TOUCH_SECONDS = 1.0
 """A touch later than this after the first is a second one."""
+AIM_WIDTH = 5.0**-0.5
+"""Of the paper's reward for aim, exp(-5 d^2) (m)."""
 LEGS = tuple(f"{side}_{link}" for side in "LR" for link in ("Hip", "Knee", "Ankle", "Toe"))
 """Links that may kick."""
 ANKLES = ("L_Ankle", "R_Ankle")
@@ -61,10 +63,16 @@ class PenaltyKick:
     """Reward for each metre by which a foot has come nearer to the ball than ever before in the
     episode, until the ball is kicked; 0 for the paper's terms alone. What they pay before, the
     root's way to the ball, is paid for sitting down at it too."""
+    aim_width: float = AIM_WIDTH
+    """Metres between the ball's way and the target over which the reward for aim falls to 1/e. Half
+    of the goal is further from a target than the paper's width can be felt: a kicker that shoots
+    at the middle learns more from 1 or 2."""
 
     def __post_init__(self) -> None:
         if self.reach < 0.0:
             raise ValueError(f"the reward for reaching must not be negative: {self.reach}")
+        if self.aim_width <= 0.0:
+            raise ValueError(f"the width of the aim must be positive: {self.aim_width}")
 
 
 def scene(config: PenaltyKick, body: Body) -> Scene:
@@ -156,7 +164,8 @@ def advance(view: View, memory: Memory) -> Advance:
     closer = gain > LEAST_GAIN
     entry, arrives = predicted_entry(view, place, linvel)
     entry = torch.where(crosses[:, None], at, entry)
-    near = torch.exp(-5.0 * (entry - target).square().sum(-1)) * (arrives | crosses)
+    off = (entry - target).square().sum(-1) / view.config.aim_width**2
+    near = torch.exp(-off) * (arrives | crosses)
     to_ball = length(root - ball)
     past = (root_x - SPOT[0]).clamp(min=0.0)
     # A touch against the rules pays nothing for where the ball goes.

@@ -156,6 +156,19 @@ def test_a_ball_that_would_fall_short_is_expected_on_the_ground():
     assert step.terms["aim"][0, 0] == pytest.approx(0.8 * math.exp(-5 * 0.19**2), abs=1e-5)
 
 
+def test_a_wider_aim_is_felt_from_further_away():
+    """1.5 m beside the target: nothing by the paper's width, exp(-9/4) of it by one of 1 m."""
+    off = math.hypot(1.5, 0.19)
+    for width, paid in ((None, math.exp(-5.0 * off**2)), (1.0, math.exp(-(off**2)))):
+        options = {} if width is None else {"aim_width": width}
+        pitch = kicker(ball=(6.0, 1.5, 0.3), target=(16.0, 0.0, 0.3), **options)
+        pitch.ball((6.3, 1.5, 0.3), (9.0, 0.0, 0.0))
+        step = pitch.advance("agent0/R_Toe")
+        assert step.terms["aim"][0, 0] == pytest.approx(0.8 * paid, abs=1e-6)
+    with pytest.raises(ValueError, match="positive"):
+        make_env("penalty_kick", num_worlds=1, options={"aim_width": 0.0})
+
+
 @pytest.mark.parametrize(("clock", "pays"), [(88, True), (90, False)])
 def test_the_aim_counts_only_if_the_ball_arrives_in_time(clock, pays):
     """10 m at 10 m/s take 30 steps; after the step 31 or 29 are left."""
