@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -75,6 +76,19 @@ class Reference:
         return Reference(*(hold(getattr(self, f.name)) for f in fields(self)))
 
 
+class Placed(NamedTuple):
+    """Where the support points and links of N candidates are (m)."""
+
+    x: np.ndarray
+    """(N, K) of the points."""
+    height: np.ndarray
+    """(N, K) of the balls around them over the ground."""
+    rear: np.ndarray
+    """(N, B) smallest x of each link."""
+    standing: np.ndarray
+    """(N, B) bool, links that leave a mark now."""
+
+
 @dataclass(frozen=True)
 class JumpRules:
     """Contacts that the long jump punishes, from the links' support points."""
@@ -87,25 +101,41 @@ class JumpRules:
     weights: Weights
 
     @cached_property
-    def _points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Support points (K, 3) in their links' frames, radii (K,) and link indices (K,)."""
+    def _points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Support points (K, 3) in their links' frames, radii (K,), link indices (K,), and the
+        first point of each link (B,)."""
         geometry = Geometry(self.body, "cpu")
-        return geometry.points.numpy(), geometry.radii.numpy(), geometry.owner.numpy()
+        owner = geometry.owner.numpy()
+        first = np.searchsorted(owner, np.arange(self.body.num_links))
+        return geometry.points.numpy(), geometry.radii.numpy(), owner, first
 
-    def cost(self, at: int, pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
-        """(N,) of links at pos (N, B, 3) with rotation matrices mat (N, B, 3, 3) at a frame."""
-        points, radii, owner = self._points
+    def placed(self, pos: np.ndarray, mat: np.ndarray) -> Placed:
+        """Of links at pos (N, B, 3) with rotation matrices mat (N, B, 3, 3)."""
+        points, radii, owner, first = self._points
         x, height = (
             pos[:, owner, i] + np.einsum("nkj,kj->nk", mat[:, owner, i], points) for i in (0, 2)
         )
         height = height - radii
+        low = np.minimum.reduceat(height, first, axis=1)
+        rear = np.minimum.reduceat(x - radii, first, axis=1)
+        return Placed(x, height, rear, standing=low < long_jump.TOUCH)
+
+    def cost(self, at: int, here: Placed, before: Placed, touched: np.ndarray) -> np.ndarray:
+        """(N,) at a frame; ``before`` is the frame before it, ``touched`` (N, B) tells which links
+        met the ground in the control step between them."""
         if at <= self.takeoff:
-            beyond = np.where(height < 0.01, x - long_jump.LINE_X + 0.01, 0.0)
+            beyond = np.where(here.height < 0.01, here.x - long_jump.LINE_X + 0.01, 0.0)
             return self.weights.foul * np.maximum(beyond.max(1), 0.0)
+        if at <= self.takeoff + 4:
+            return np.zeros(len(here.x))
         # Near the ground counts in part, so that candidates see a slope before they touch.
-        near = np.clip(1.0 - height / 0.15, 0.0, 1.0)
-        behind = np.maximum(self.mark - x, 0.0) * near
-        return self.weights.mark * behind.max(1) if at > self.takeoff + 4 else np.zeros(len(x))
+        near = np.clip(1.0 - here.height / 0.15, 0.0, 1.0)
+        behind = np.maximum(self.mark - here.x, 0.0) * near
+        # A link that touched and is off again is measured at its rear, here or a step before.
+        brief = touched & ~here.standing
+        rear = np.minimum(here.rear, before.rear)
+        passed = np.maximum(self.mark - rear, 0.0) * brief
+        return self.weights.mark * np.maximum(behind.max(1), passed.max(1))
 
 
 def jump_rules(clip: Clip, scene: Scene, weights: Weights) -> JumpRules:
