@@ -235,7 +235,7 @@ def test_a_cluster_without_ray_or_an_answer_is_a_sentence(fake, tmp_path, monkey
 
 
 def test_the_shipped_sweep_is_of_certified_jumps():
-    """What a notebook reads without a solver: planned beyond what was asked by the margin of 0.15 m,
+    """What a notebook reads without a solver: planned beyond what was asked by 0.15 m, the margin,
     and by no more than the 0.12 m besides that the heels may. A heel counts once it is 5 mm above
     the ground, some ms before the plan ends: it goes up to 5 cm further by then."""
     jumps = shipped_sweep("long_jump", "length")
