@@ -38,8 +38,8 @@ the optimised motion by itself. *In MuJoCo* is the shipped clip: jumps and strid
 tracked in closed loop and judged by the rules of the sport, lunges played open loop. *Open loop in
 Drake* is the planned torques alone, without any feedback: what a jump loses there is what tracking
 is for. A long jump is measured to the nearest mark of any part of the body within 0.3 s of the
-landing; 0 is an attempt that is not valid. The one of 7 m falls short of its length: at 9 m/s a
-link that touches between two control steps is measured where its rear was up to 0.3 m before.
+landing; 0 is an attempt that is not valid. A link that touches between two control steps
+is measured where its rear was up to 0.3 m before, and the tracker knows that.
 
 """
 

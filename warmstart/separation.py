@@ -52,17 +52,26 @@ def axis_balls(body: Body, link: str, count: int = 2) -> list[Ball]:
     return [Ball(link, (float(p[0]), float(p[1]), float(p[2])), radius) for p in points]
 
 
-def keep_apart(program: Transcription, body: Body, knots: Sequence[int] | np.ndarray) -> None:
-    """Adds the rows at knots: legs and hands on their sides, hands off the legs (50 a knot)."""
+def keep_apart(
+    program: Transcription,
+    body: Body,
+    knots: Sequence[int] | np.ndarray,
+    straight: bool = False,
+) -> None:
+    """Adds the rows at knots: legs and hands on their sides, hands off the legs (50 a knot).
+
+    ``straight``: hands may pass knees that are hardly bent, so they keep off the upper ends of the
+    shins as well, which the thighs cover otherwise (4 rows more a knot).
+    """
     import casadi as ca
 
     model = program.model
     hands = {s: [axis_balls(body, f"{s}_{n}")[-1] for n in HAND] for s in "LR"}
     own = {s: [b for n in LEG for b in axis_balls(body, f"{s}_{n}")] + hands[s] for s in "LR"}
-    # The upper end of a shin is covered by the thigh.
+    shin = slice(0 if straight else 1, None)
     lifted = {
         s: axis_balls(body, f"{s}_Hip", 3)
-        + axis_balls(body, f"{s}_Knee", 3)[1:]
+        + axis_balls(body, f"{s}_Knee", 3)[shin]
         + [b for n in ("Ankle", "Toe") for b in axis_balls(body, f"{s}_{n}")]
         for s in "LR"
     }

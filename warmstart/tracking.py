@@ -103,11 +103,14 @@ class Worlds:
     are asked for, in double precision, and reads no forces.
     """
 
-    def __init__(self, scene: Scene, worlds: int, threads: int) -> None:
-        root = body_name(0, scene.body.link_names[0])
+    def __init__(self, scene: Scene, worlds: int, threads: int, feel: bool = False) -> None:
+        """``feel``: notes which links touch the ground, see ``touched``."""
+        names = scene.body.link_names
+        root = body_name(0, names[0])
+        ground = [f"ground:{body_name(0, name)}" for name in names] if feel else []
         spec = build_spec(scene)
-        for sensor in list(spec.sensors):  # nobody reads forces here, and they cost time
-            if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT:
+        for sensor in list(spec.sensors):  # nobody reads other forces here, and they cost time
+            if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT and sensor.name not in ground:
                 spec.delete(sensor)
         self.scene, self.model, self._root = scene, spec.compile(), root
         self.batch = Batch(self.model, nsim=worlds, nthread=threads)
@@ -115,8 +118,13 @@ class Worlds:
         self.qpos, self.qvel, self.ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
         self.warm = bind("qacc_warmstart")
         self.xpos, self.xquat, self.xmat = bind("xpos"), bind("xquat"), bind("xmat")
-        names = scene.body.link_names
         self.links = np.array([self.model.body(body_name(0, name)).id for name in names])
+        first = [self.model.sensor(name).adr[0] for name in ground]
+        self._ground = np.add.outer(first, np.arange(3)).astype(int)  # columns of their forces
+        self._sensors = bind("sensordata")
+        self.touched = np.zeros((worlds, len(ground)), dtype=bool)
+        """(N, B) links that touched the ground in any substep of the last control step; (N, 0) if
+        that is not felt."""
         self._keepers: dict[int, AthleteKeeper] = {}
 
     def put(self, count: int, qpos: np.ndarray, qvel: np.ndarray, warm: np.ndarray) -> None:
@@ -128,19 +136,27 @@ class Worlds:
         self.keeper.forget()
         self.qpos[:count], self.qvel[:count], self.warm[:count] = qpos, qvel, warm
         self.batch.forward(ids=self.ids, stage=_VEL)
+        self._shift = np.zeros((count, 3))
 
     def step(self, ctrl: np.ndarray) -> None:
         """One control step of the worlds that were put."""
         self.ctrl[self.ids] = ctrl
+        self.touched = np.zeros((len(self.ids), len(self._ground)), dtype=bool)
         for substep in range(self.scene.substeps):
             last = substep == self.scene.substeps - 1
             self.batch.step(ids=self.ids, stage=_VEL if last else 0)
+            self.touched |= self._sensors[: len(self.ids), self._ground].any(2)
             _, self._shift = self.keeper.correct(current=last)
 
     @property
     def link_pos(self) -> np.ndarray:
         """(N, B, 3) positions of the links (m)."""
         return self.xpos[: len(self.ids), self.links] + self._shift[:, None]
+
+    @property
+    def link_mat(self) -> np.ndarray:
+        """(N, B, 3, 3) rotation matrices of the links."""
+        return self.xmat[: len(self.ids), self.links].reshape(len(self.ids), -1, 3, 3)
 
     @property
     def whole(self) -> np.ndarray:
@@ -183,7 +199,8 @@ def track(
     if scene.body.name != clip.body:
         raise ValueError(f"the clip is of body '{clip.body}', the scene of '{scene.body.name}'")
     begin = time.perf_counter()
-    worlds = Worlds(scene, settings.worlds, threads)
+    jumps = clip.meta.get("problem") == "long_jump"
+    worlds = Worlds(scene, settings.worlds, threads, feel=jumps)
     frames = _reference(clip, worlds)
     weights = settings.weights or weights_of(clip.meta.get("problem", ""))
     steps, rules = len(frames.ctrl) - 1, None
@@ -191,7 +208,7 @@ def track(
     if clip.meta.get("problem") in task_names():
         after = settings.after if outcome is None else min(settings.after, outcome.after)
         frames = frames.held(after)  # the bar and the mark are lost after the landing
-    if clip.meta.get("problem") == "long_jump":
+    if jumps:
         rules = jump_rules(clip, scene, weights)
     qpos, qvel, ctrl = _follow(frames, steps, worlds, settings, weights, rules, progress)
     tracked = replace(
@@ -381,6 +398,7 @@ def _rollout(
     count = len(targets)
     worlds.put(count, *state)
     cost = np.zeros(count)
+    before = rules.placed(worlds.link_pos, worlds.link_mat) if rules is not None else None
     for k in range(targets.shape[1]):
         worlds.step(targets[:, k])
         at = now + k + 1
@@ -399,9 +417,10 @@ def _rollout(
         )
         if at > end:
             step *= weights.after
-        if rules is not None:
-            mat = worlds.xmat[:count, worlds.links].reshape(count, -1, 3, 3)
-            step += rules.cost(at, pos, mat)
+        if rules is not None and before is not None:
+            here = rules.placed(pos, worlds.link_mat)
+            step += rules.cost(at, here, before, worlds.touched)
+            before = here
         if has_bar:
             shift = np.linalg.norm(worlds.qpos[:count, bar][:, :3] - rest, axis=1)
             speed = np.linalg.norm(worlds.qvel[:count, bar_rate][:, :3], axis=1)

@@ -235,11 +235,13 @@ def test_a_cluster_without_ray_or_an_answer_is_a_sentence(fake, tmp_path, monkey
 
 
 def test_the_shipped_sweep_is_of_certified_jumps():
-    """What a notebook reads without a solver: planned near what was asked, in the values' order."""
+    """What a notebook reads without a solver: planned beyond what was asked by 0.15 m, the margin,
+    and by no more than the 0.12 m besides that the heels may. A heel counts once it is 5 mm above
+    the ground, some ms before the plan ends: it goes up to 5 cm further by then."""
     jumps = shipped_sweep("long_jump", "length")
     assert len(jumps) >= 9 and all(r.status == "certified" for r in jumps)
     for r in jumps:
-        assert r.achieved["planned"] == pytest.approx(r.value, abs=0.1)
+        assert 0.1 < r.achieved["planned"] - r.value < 0.271
         # The flight of its centre of mass, in the time that it took, is most of the length.
         angle = np.radians(r.figures["takeoff_angle"])
         flown = r.figures["takeoff_speed"] * np.cos(angle) * r.figures["flight_time"]
