@@ -25,6 +25,7 @@ from rl.latent_action import LatentActions, LatentConfig
 from rl.networks import MLP
 from rl.policy_stack import unstacked
 from rl.prior import LatentPrior, PriorError, find_prior
+from rl.provenance import portable
 from warmstart.atomic import write_bytes, write_text
 
 FORMAT = "olympics-opt policy 1"
@@ -317,17 +318,6 @@ def _build(card: dict[str, Any], weights: dict[str, Tensor], where: str) -> Poli
     return Policy(actor, mean, std, card)
 
 
-def _portable(config: dict[str, Any]) -> dict[str, Any]:
-    """A run's settings without what is only true on the machine where it ran."""
-    config = {k: v for k, v in config.items() if k not in ("out", "resume", "quiet", "device")}
-    if isinstance(config.get("clips"), list):
-        config["clips"] = [Path(p).name for p in config["clips"]]
-    for name in ("init", "prior", "tracker"):
-        if config.get(name):
-            config[name] = Path(config[name]).name
-    return config
-
-
 def export_policy(
     run: Path | str,
     out: Path | str,
@@ -370,7 +360,7 @@ def export_policy(
             f"of '{run}': evaluate that one"
         )
     card: dict[str, Any] = {**policy.metadata, "sha256": digest}
-    card["config"] = _portable(card.get("config", {}))
+    card["config"] = portable(card.get("config", {}))
     if metrics is not None:
         card["metrics"] = metrics
     if looks:

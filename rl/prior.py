@@ -28,6 +28,7 @@ from rl import pretrained
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.networks import MLP
 from rl.prior_pose import PosePart
+from rl.provenance import portable
 from rl.steady import Steady
 from sports.frames import proprioception_slices
 from sports.humanoid.body import Body, load_body
@@ -272,6 +273,8 @@ def save_prior(prior: LatentPrior, out: Path | str, *, half: bool, encoder: bool
     digest = hashlib.sha256(data).hexdigest()
     precision = "float16" if half else "float32"
     card = {**prior.card, "precision": precision, "sha256": digest, "digest": prior.digest}
+    if isinstance(card.get("config"), dict):
+        card["config"] = portable(card["config"])
     path = Path(out).with_suffix(".safetensors")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, data)

@@ -8,6 +8,7 @@ import platform
 import subprocess
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -70,3 +71,14 @@ def hardware() -> str:
         names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
         line = f"{len(names)} x {names[0]}, {line}"
     return line
+
+
+def portable(config: dict[str, Any]) -> dict[str, Any]:
+    """A run's settings without what is only true on the machine where it ran."""
+    config = {k: v for k, v in config.items() if k not in ("out", "resume", "quiet", "device")}
+    if isinstance(config.get("clips"), list):
+        config["clips"] = [Path(p).name for p in config["clips"]]
+    for name in ("init", "prior", "tracker"):
+        if config.get(name):
+            config[name] = Path(config[name]).name
+    return config

@@ -204,3 +204,13 @@ def test_a_prior_is_no_policy(tmp_path):
     path = save_prior(made_prior(), tmp_path / "p", half=False)
     with pytest.raises(PolicyError, match="not the card of a policy"):
         load_policy(path, "hurdling")
+
+
+def test_the_shipped_prior_is_whole_and_small():
+    """It stands by what it learned in ``balance``; tracker and prior together are at most 14 MB."""
+    prior = load_prior("pretrained")
+    assert prior.encoder and prior.steady is not None
+    shipped = list(priors.pretrained.FOLDER.glob("*/*.safetensors"))
+    own = [p.stat().st_size for p in shipped if p.parent.name in ("prior", "tracking")]
+    assert len(own) == 2 and sum(own) <= 14e6
+    assert sum(p.stat().st_size for p in shipped) <= 30e6

@@ -472,3 +472,9 @@ def test_the_commands(folder, tmp_path, capsys):
         said = capsys.readouterr().err
         assert sentence in said and len(said.strip().splitlines()) == 1, said
     assert not list(tmp_path.glob("none*"))
+
+
+def test_a_prior_tells_nothing_of_the_machine_that_made_it(folder):
+    card = json.loads((folder / "prior" / "prior.json").read_text())
+    assert "out" not in card["config"] and card["config"]["clips"] == ["golf.npz"]
+    assert str(folder) not in json.dumps(card)
