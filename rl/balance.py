@@ -72,7 +72,8 @@ def make_balance_env(config: Any, seed: int, physics_options: dict[str, Any]) ->
             raise ValueError(f"the prior's athlete is one of {name} '{value}': give --{name}")
     library = load_library(config.clips).split(options.split)
     body = load_body(library.body, strength=config.strength, limits=config.limits)
-    scene = humanoid_scene(body)
+    plain, finer = humanoid_scene(body), config.timestep_divisor
+    scene = replace(plain, timestep=plain.timestep / finer, substeps=plain.substeps * finer)
     physics = make_physics(config.engine, scene, config.num_worlds, **physics_options)
     tables = MotionTables(library, physics.device)
     task = replace(

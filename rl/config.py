@@ -196,6 +196,8 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
             yield "balance is learned by a latent prior: give --prior"
         if c.algo != "ppo" or c.clone or c.latent != LatentConfig():
             yield "balance is ppo on the prior as it plays: leave --algo, --clone, --latent out"
+        if (c.ppo.sigma, c.ppo.sigma_final) not in ((PPOConfig.sigma, None), (1.0, None)):
+            yield "the noise of balance is the prior's own: leave --ppo.sigma out"
     if c.prior is None and (c.algo.startswith("latent") or c.latent != LatentConfig()):
         yield "--algo latent and the --latent options need --prior"
     if c.prior is not None and c.task in (TRACKING, PRIOR):

@@ -101,6 +101,25 @@ def test_a_step_on_its_feet_pays_until_the_time_is_up(folder):
         env.close()
 
 
+def test_a_finer_time_step_is_heard(folder):
+    env = make_balance_env(run_config(folder, timestep_divisor=2), 0, {})
+    try:
+        scene = env.physics.scene
+        assert (scene.timestep, scene.substeps) == (pytest.approx(1 / 240), 8)
+    finally:
+        env.close()
+
+
+def test_it_may_begin_from_what_was_learned_before(folder, tmp_path):
+    """With a rate of almost nothing the new run's prior is the old one's."""
+    still = replace(SMALL, learning_rate=1e-12, kl_band=None)
+    again = run_config(folder, out=tmp_path / "again", init=str(folder / "run"), ppo=still)
+    train(again)
+    one, two = load_prior(folder / "run"), load_prior(again.out)
+    for name, weight in one.steady.net.state_dict().items():
+        torch.testing.assert_close(two.steady.net.state_dict()[name], weight, rtol=0, atol=1e-6)
+
+
 def test_lying_is_a_fall(folder):
     """Hand-made: the athlete of the first frame laid on its back."""
     env = make_balance_env(run_config(folder), 0, {})
@@ -130,6 +149,8 @@ def test_mistakes_are_told(folder, tmp_path):
         train(run_config(folder, strength="human", out=tmp_path / "b"))
     with pytest.raises(ValueError, match="leave --algo"):
         run_config(folder, algo="amp")
+    with pytest.raises(ValueError, match=r"leave --ppo\.sigma out"):
+        run_config(folder, ppo=replace(SMALL, sigma=0.3))
     with pytest.raises(ValueError, match="seconds"):
         BalanceConfig(seconds=0.0)
     with pytest.raises(PriorError, match="learned to balance already"):
