@@ -13,21 +13,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
-
-from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.motion import MotionTables
-from rl.prior import FILE, LatentPrior, PriorError, load_prior
+from rl.policy import PolicyError, load_policy
+from rl.prior import LatentPrior, PriorError
 from rl.prior_play import free_task, upright_frames
-from rl.steady import Steady
+from rl.steady import BALANCE, Steady
 from sports.env import Env
 from sports.humanoid.body import load_body
 from sports.physics import make_physics
-from sports.scene import humanoid_scene
+from sports.scene import finer, humanoid_scene
 from sports.task import Advance, Memory, View
 from warmstart.library import FPS, load_library
-
-NAME = "balance"
 
 
 @dataclass(frozen=True)
@@ -55,30 +51,19 @@ def advance(view: View, memory: Memory) -> Advance:
 def make_balance_env(config: Any, seed: int, physics_options: dict[str, Any]) -> Env:
     """Worlds for a run (TrainConfig) of the task ``balance``.
 
-    Raises ValueError without clips, PriorError for a prior that is none, of another athlete, or has
-    learned to balance already.
+    Raises ValueError without clips.
     """
     options = BalanceConfig(**config.options)
     if not config.clips:
         raise ValueError("balance begins in frames of clips: give --clips LIBRARY")
-    prior = load_prior(config.prior)
-    if prior.steady is not None:
-        raise PriorError(
-            f"the prior '{config.prior}' has learned to balance already: give the one it came from"
-        )
-    for name in ("strength", "limits"):
-        value = str(prior.card.get(name, "paper"))
-        if getattr(config, name) != value:
-            raise ValueError(f"the prior's athlete is one of {name} '{value}': give --{name}")
     library = load_library(config.clips).split(options.split)
     body = load_body(library.body, strength=config.strength, limits=config.limits)
-    plain, finer = humanoid_scene(body), config.timestep_divisor
-    scene = replace(plain, timestep=plain.timestep / finer, substeps=plain.substeps * finer)
+    scene = finer(humanoid_scene(body), config.timestep_divisor)
     physics = make_physics(config.engine, scene, config.num_worlds, **physics_options)
     tables = MotionTables(library, physics.device)
     task = replace(
         free_task(tables, upright_frames(tables), library.body),
-        name=NAME,
+        name=BALANCE,
         config=BalanceConfig,
         advance=advance,
         metrics={"success": "fraction", "seconds": "s"},
@@ -88,24 +73,35 @@ def make_balance_env(config: Any, seed: int, physics_options: dict[str, Any]) ->
     return Env(task, options, physics, seed=seed, training=True)
 
 
+def check_unsteady(prior: LatentPrior, config: Any) -> None:
+    """Raises PriorError for a prior that has learned to balance already, ValueError for one whose
+    athlete is not that of the run (TrainConfig)."""
+    if prior.steady is not None:
+        raise PriorError(
+            f"the prior '{config.prior}' has learned to balance already: give the one it came from"
+        )
+    for name in ("strength", "limits"):
+        value = str(prior.card.get(name, "paper"))
+        if getattr(config, name) != value:
+            raise ValueError(f"the prior's athlete is one of {name} '{value}': give --{name}")
+
+
 def steadied(run: Path) -> LatentPrior:
     """The prior that a run of ``balance`` began with, with what it has learned since.
 
     Raises PriorError for a run that cannot be used.
     """
-    prior = load_prior(run / FILE)
-    saved = checkpoints(run)
     try:
-        state, tensors = load_checkpoint(saved[-1])
-        card = dict(state["card"])
-        steady = Steady.of(card, prior.size, prior.latent)
-        start = "agent/actor."
-        weights = {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
-        steady.net.load_state_dict(weights)
-        steady.mean.copy_(torch.tensor(card["obs_mean"]))
-        steady.std.copy_(torch.tensor(card["obs_std"]))
-    except (CheckpointError, KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+        policy = load_policy(run, BALANCE)
+    except PolicyError as error:
         raise PriorError(f"the run '{run}' cannot be used: {error}") from error
+    prior, card = policy.prior, policy.metadata
+    assert prior is not None and policy.actor is not None
+    steady = Steady.of(card, prior.size, prior.latent)
+    steady.load_state_dict(
+        {f"net.{k}": v for k, v in policy.actor.state_dict().items()}
+        | {"mean": policy.mean, "std": policy.std}
+    )
     learned = {k: card.get(k) for k in ("samples", "minutes", "commit", "metrics")}
     more = {"steady": {**steady.card(), "learned": learned}}
     own = {k: v for k, v in prior.card.items() if k not in ("sha256", "digest")}

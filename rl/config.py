@@ -14,6 +14,7 @@ from rl.amp import AMPConfig
 from rl.latent_action import LatentConfig
 from rl.ppo import PAPER, PPOConfig
 from rl.selfplay import SelfPlayConfig
+from rl.steady import BALANCE
 from sports.env import Starts
 from sports.registry import get_task, task_names
 
@@ -23,8 +24,6 @@ TRACKING = "tracking"
 """The task of the motion tracker. It is not in the registry: it is nothing without clips."""
 PRIOR = "prior"
 """The distillation of the tracker into a latent prior: not a sport either."""
-BALANCE = "balance"
-"""Where a latent prior learns to stay on its feet."""
 APART = (TRACKING, PRIOR, BALANCE)
 """Tasks beside the registry: those that need clips."""
 

@@ -45,6 +45,10 @@ def act_through_prior(env: Any, config: TrainConfig) -> None:
                 f"the run {config.out} acts through the prior {str(wanted)[:12]}..., not "
                 f"{prior.digest[:12]}...: give that one"
             )
+    if config.task == BALANCE:
+        from rl.balance import check_unsteady
+
+        check_unsteady(prior, config)
     how = LatentConfig("scaled", span=1.0) if config.task == BALANCE else config.latent
     layer = LatentActions(prior, how, env.physics.scene, env.task.tools, env.device)
     layer.check(env.obs_slices)

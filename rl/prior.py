@@ -29,7 +29,7 @@ from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.networks import MLP
 from rl.prior_pose import PosePart
 from rl.provenance import portable
-from rl.steady import Steady
+from rl.steady import BALANCE, Steady
 from sports.frames import proprioception_slices
 from sports.humanoid.body import Body, load_body
 from warmstart.atomic import write_bytes, write_text
@@ -361,7 +361,7 @@ def _from_run(run: Path) -> LatentPrior:
         card = dict(state["card"])
     except (CheckpointError, KeyError, TypeError, ValueError) as error:
         raise PriorError(f"the run '{run}' cannot be used: {error}") from error
-    if card.get("task") == "balance":
+    if card.get("task") == BALANCE:
         from rl.balance import steadied
 
         return halved(steadied(run))

@@ -16,6 +16,9 @@ from torch import Tensor, nn
 
 from rl.networks import MLP, Activation
 
+BALANCE = "balance"
+"""The task in which it is learned."""
+
 
 class Steady(nn.Module):
     """(..., S) raw observations of the own body -> (..., Z) standard deviations of the prior."""

@@ -30,7 +30,7 @@ from rl.tracking_terms import (
 from sports.env import Env
 from sports.humanoid.body import load_body
 from sports.physics import Physics, PhysicsState, make_physics
-from sports.scene import Scene, humanoid_scene
+from sports.scene import Scene, finer, humanoid_scene
 from sports.task import Advance, Memory, Task, View
 from warmstart.library import FPS, Library, load_library
 
@@ -402,11 +402,6 @@ def make_tracking_env(
     elif len(assigned) != num_worlds:
         raise ValueError(f"{num_worlds} worlds need as many clips, not {len(assigned)}")
     body = load_body(library.body, strength=strength, limits=limits)  # type: ignore[arg-type]
-    plain = humanoid_scene(body)
-    scene = humanoid_scene(
-        body,
-        timestep=plain.timestep / timestep_divisor,
-        substeps=plain.substeps * timestep_divisor,
-    )
+    scene = finer(humanoid_scene(body), timestep_divisor)
     physics = make_physics(engine, scene, num_worlds, **(physics_options or {}))
     return TrackingEnv(library, config, physics, seed=seed, training=training, clips=assigned)

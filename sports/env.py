@@ -19,7 +19,7 @@ from sports.frames import proprioception, proprioception_slices
 from sports.humanoid.body import Limits, Strength, load_body
 from sports.physics import Physics, PhysicsState, default_state, make_physics
 from sports.registry import get_task, make_config
-from sports.scene import Scene
+from sports.scene import Scene, finer
 from sports.starts import ELAPSED, Starts, Stock, add_noise
 from sports.task import Memory, Task, View, falling_forces, falling_heights
 from sports.turns import nearest_turn
@@ -419,16 +419,9 @@ def make_scene(
 ) -> Scene:
     """The scene of a task at a strength. ``timestep_divisor`` 2 halves the time step at the same
     control rate. Raises ValueError for an unknown task, option, strength or limits."""
-    if timestep_divisor < 1:
-        raise ValueError(f"timestep_divisor must be at least 1, not {timestep_divisor}")
     record = get_task(task)
     body = load_body(record.body, strength=strength, limits=limits, equipment=record.equipment)
-    scene = record.scene(make_config(record, options), body)
-    return dataclasses.replace(
-        scene,
-        timestep=scene.timestep / timestep_divisor,
-        substeps=scene.substeps * timestep_divisor,
-    )
+    return finer(record.scene(make_config(record, options), body), timestep_divisor)
 
 
 def make_env(

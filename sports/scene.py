@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -307,3 +307,11 @@ class Scene:
 def humanoid_scene(body: Body, **kwargs: object) -> Scene:
     """One athlete on the ground and nothing else, for parity tests and optimisation."""
     return Scene(name=f"{body.name}_alone", body=body, **kwargs)  # type: ignore[arg-type]
+
+
+def finer(scene: Scene, divisor: int) -> Scene:
+    """The same control step in ``divisor`` times as many physics steps. Raises ValueError for a
+    divisor below 1."""
+    if divisor < 1:
+        raise ValueError(f"timestep_divisor must be at least 1, not {divisor}")
+    return replace(scene, timestep=scene.timestep / divisor, substeps=scene.substeps * divisor)

@@ -183,9 +183,12 @@ def test_an_altered_card_is_refused(folder, tmp_path, spoil):
 
 
 def test_a_run_goes_on_bit_for_bit(folder, tmp_path):
+    """And with the run's own copy of the prior alone."""
     whole = train(run_config(folder, out=tmp_path / "whole"))
-    part = run_config(folder, out=tmp_path / "part")
+    prior = save_prior(made_prior(), tmp_path / "prior.safetensors", half=False)
+    part = run_config(folder, out=tmp_path / "part", prior=str(prior))
     train(part, part=0.4)
+    prior.unlink()
     train(replace(part, resume=True))
     one, two = (load_prior(out) for out in (whole.out, part.out))
     assert one.digest == two.digest
