@@ -77,14 +77,16 @@ class Solve:
 
 @dataclass(frozen=True)
 class Export:
-    """Make a policy file of a run: the actor in fp16 (safetensors) and its card (JSON)."""
+    """Make a policy file of a run: the actor (safetensors) and its card (JSON)."""
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
-    """Folder of the run; its last checkpoint is taken."""
+    """Folder of the run, of which the last checkpoint is taken; or a policy file."""
     out: Path
     """The policy file, FILE.safetensors; the card is FILE.json beside it."""
     critic: bool = False
     """Keep the critic too, so that fine-tuning (``train --init``) need not begin without one."""
+    precision: Literal["float16", "int8"] = "float16"
+    """Of the weights. int8 takes half the room; evaluate what you export with it."""
     looks: str = ""
     """What its motion looks like, in words, for the card."""
     result: Path | None = None

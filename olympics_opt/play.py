@@ -262,8 +262,10 @@ def run_export(config: Export) -> int:
     file cannot be written."""
     from rl.policy import export_policy
 
-    if not config.run.is_dir():
-        raise ValueError(f"there is no run '{config.run}': give the folder that `train` wrote")
+    if not config.run.exists():
+        raise ValueError(
+            f"there is no run '{config.run}': give the folder that `train` wrote, or a policy file"
+        )
     if config.out.suffix != ".safetensors":
         raise ValueError(f"{config.out} must end in .safetensors")
     metrics, of = None, ""
@@ -277,6 +279,7 @@ def run_export(config: Export) -> int:
         metrics_of=of,
         looks=config.looks,
         critic=config.critic,
+        precision=config.precision,
     )
     print(f"wrote {path} ({path.stat().st_size / 2**20:.1f} MiB) and {path.with_suffix('.json')}")
     return 0

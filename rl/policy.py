@@ -1,4 +1,5 @@
-"""Trained policies as files: an actor in fp16 safetensors and a JSON card that says what it is.
+"""Trained policies as files: an actor in safetensors, fp16 or int8, and a JSON card that says what
+it is.
 
 ``load_policy`` accepts such a file, a run's folder, a frozen opponent of a run of self-play
 (``RUN@SAMPLES``, ``RUN@rival``), ``pretrained[:ALGO[-STRENGTH]]``, and the baselines ``zero`` and
@@ -11,7 +12,7 @@ import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from safetensors import SafetensorError
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from rl import pretrained
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
+from rl.int8 import packed, unpacked
 from rl.latent_action import LatentActions, LatentConfig
 from rl.networks import MLP
 from rl.policy_stack import unstacked
@@ -264,6 +266,10 @@ def _from_file(path: Path) -> Policy:
         raise PolicyError(f"'{card_path}' is not the card of a policy of this project")
     if card.get("sha256") != hashlib.sha256(data).hexdigest():
         raise PolicyError(f"'{path}' does not belong to its card: the sha256 differs")
+    try:
+        weights = unpacked(weights)
+    except ValueError as error:
+        raise PolicyError(f"the weights of policy '{path}' are damaged: {error}") from None
     extra = {k: v for k, v in weights.items() if k.startswith(("critic.", "value_norm."))}
     actor = {k: v.float() for k, v in weights.items() if k not in extra}
     policy = _build(card, actor, str(path))
@@ -326,22 +332,24 @@ def export_policy(
     metrics_of: str = "",
     looks: str = "",
     critic: bool = False,
+    precision: Literal["float16", "int8"] = "float16",
 ) -> Path:
-    """Writes a run's actor as ``OUT.safetensors`` (fp16) and ``OUT.json``; returns the former.
+    """Writes an actor as ``OUT.safetensors`` and ``OUT.json``; returns the former.
 
     Args:
-        run: the run's folder; its last checkpoint is taken.
+        run: a run's folder, of which the last checkpoint is taken, or a policy file.
         out: target; any suffix becomes ``.safetensors``.
         metrics: an evaluation's metrics for the card; the run's last ones if None.
         metrics_of: sha256 of the policy that was evaluated, where it is known: it must be the
             run's (its last checkpoint) or that of this export.
         looks: what the motion looks like, in words.
         critic: keep the critic too, so that fine-tuning need not begin without one.
+        precision: of the weights; int8 takes half the room, matrices row by row (``rl/int8.py``).
 
-    Raises PolicyError when the run has no readable checkpoint, when its weights do not fit fp16,
-    and for metrics of another policy.
+    Raises PolicyError when there is no readable checkpoint or policy, when its weights do not fit
+    fp16, and for metrics of another policy.
     """
-    policy = _from_run(Path(run))
+    policy = _from_run(Path(run)) if Path(run).is_dir() else _from_file(Path(run))
     assert policy.actor is not None
     weights = dict(policy.actor.state_dict())
     if critic:
@@ -352,6 +360,8 @@ def export_policy(
     }
     if not all(torch.isfinite(v).all() for v in weights.values()):
         raise PolicyError(f"the weights of run '{run}' do not fit fp16")
+    if precision == "int8":
+        weights = packed(weights)
     data = save(weights)
     digest = hashlib.sha256(data).hexdigest()
     if metrics_of and metrics_of not in (policy.metadata["sha256"], digest):
@@ -359,7 +369,7 @@ def export_policy(
             f"the metrics are of another policy ({metrics_of[:12]}...) than the last checkpoint "
             f"of '{run}': evaluate that one"
         )
-    card: dict[str, Any] = {**policy.metadata, "sha256": digest}
+    card: dict[str, Any] = {**policy.metadata, "sha256": digest, "precision": precision}
     card["config"] = portable(card.get("config", {}))
     if metrics is not None:
         card["metrics"] = metrics
