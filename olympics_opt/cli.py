@@ -80,7 +80,8 @@ class Export:
     """Make a policy file of a run: the actor (safetensors) and its card (JSON)."""
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
-    """Folder of the run, of which the last checkpoint is taken; or a policy file."""
+    """Folder of the run, of which the last checkpoint is taken; a frozen opponent in it,
+    ``RUN@SAMPLES``; or a policy file."""
     out: Path
     """The policy file, FILE.safetensors; the card is FILE.json beside it."""
     critic: bool = False

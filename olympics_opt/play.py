@@ -262,7 +262,7 @@ def run_export(config: Export) -> int:
     file cannot be written."""
     from rl.policy import export_policy
 
-    if not config.run.exists():
+    if not Path(str(config.run).partition("@")[0]).exists():
         raise ValueError(
             f"there is no run '{config.run}': give the folder that `train` wrote, or a policy file"
         )

@@ -337,7 +337,8 @@ def export_policy(
     """Writes an actor as ``OUT.safetensors`` and ``OUT.json``; returns the former.
 
     Args:
-        run: a run's folder, of which the last checkpoint is taken, or a policy file.
+        run: a run's folder, of which the last checkpoint is taken, ``RUN@SAMPLES``, or a policy
+            file.
         out: target; any suffix becomes ``.safetensors``.
         metrics: an evaluation's metrics for the card; the run's last ones if None.
         metrics_of: sha256 of the policy that was evaluated, where it is known: it must be the
@@ -349,8 +350,9 @@ def export_policy(
     Raises PolicyError when there is no readable checkpoint or policy, when its weights do not fit
     fp16, and for metrics of another policy.
     """
-    policy = _from_run(Path(run)) if Path(run).is_dir() else _from_file(Path(run))
-    assert policy.actor is not None
+    policy = read_policy(run, "")
+    if policy.actor is None:
+        raise PolicyError(f"'{run}' is a baseline: it has no weights to export")
     weights = dict(policy.actor.state_dict())
     if critic:
         weights |= policy.extra

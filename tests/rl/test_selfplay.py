@@ -18,7 +18,7 @@ from rl.checkpoint import checkpoints, load_checkpoint
 from rl.graph import GraphedStep
 from rl.networks import MLP
 from rl.normalizer import Normalizer
-from rl.policy import PolicyError, load_policy
+from rl.policy import PolicyError, export_policy, load_policy
 from rl.policy_stack import PolicyStack
 from rl.ppo import PPO
 from rl.rollout import collect
@@ -331,7 +331,10 @@ def test_a_frozen_opponent_of_a_run_is_the_run_as_it_was(tmp_path):
 
     now = said("long", 6 * 576, FEW, "@2304")
     assert torch.equal(now, said("short", 4 * 576, FEW))
-    assert load_policy(f"{tmp_path / 'long'}@2304", "contest").metadata["samples"] == 2304
+    early = load_policy(f"{tmp_path / 'long'}@2304", "contest")
+    assert early.metadata["samples"] == 2304
+    shipped = load_policy(export_policy(f"{tmp_path / 'long'}@2304", tmp_path / "early"), "contest")
+    torch.testing.assert_close(shipped(obs), now, atol=5e-3, rtol=5e-3)
     assert not torch.equal(now, load_policy(tmp_path / "long", "contest")(obs))
     # The first iteration only shows; three of learning make a turn.
     rested = said("turned", 4 * 384, dataclasses.replace(ALTERNATE, swap=3), "@rival")
