@@ -49,6 +49,10 @@ AIM_WIDTH = 5.0**-0.5
 LEGS = tuple(f"{side}_{link}" for side in "LR" for link in ("Hip", "Knee", "Ankle", "Toe"))
 """Links that may kick."""
 ANKLES = ("L_Ankle", "R_Ankle")
+FLIGHT_TIMES = tuple(2.5 / 1.1**k for k in range(45))
+"""Of the free flights to the target that ``flight`` compares with (s), 2.5 to 0.04."""
+FLIGHT = 3.0
+"""Width of the reward ``flight`` (m/s)."""
 LEAST_GAIN = 1e-3
 """Metres in a control step; less is no approach of the ball to its target."""
 REST_SPEED, REST_SECONDS = 0.1, 0.5
@@ -67,10 +71,17 @@ class PenaltyKick:
     """Metres between the ball's way and the target over which the reward for aim falls to 1/e. Half
     of the goal is further from a target than the paper's width can be felt: a kicker that shoots
     at the middle learns more from 1 or 2."""
+    flight: float = 0.0
+    """Reward in each step in which the ball gets closer, halved where its velocity is ``FLIGHT``
+    away from one that would let it fly through the target; 0 for the paper's terms alone. A ball on
+    the ground earns them without end: kicked a little upward or faster it stays there, so nothing
+    leads from it to a ball that flies."""
 
     def __post_init__(self) -> None:
         if self.reach < 0.0:
             raise ValueError(f"the reward for reaching must not be negative: {self.reach}")
+        if self.flight < 0.0:
+            raise ValueError(f"the reward for flight must not be negative: {self.flight}")
         if self.aim_width <= 0.0:
             raise ValueError(f"the width of the aim must be positive: {self.aim_width}")
 
@@ -177,6 +188,9 @@ def advance(view: View, memory: Memory) -> Advance:
         "aim": 0.8 * near * closer,
         "line": torch.exp(-0.2 * past.square()) - 1.0,
     }
+    if view.config.flight > 0.0:
+        lacks = velocity_lacking(place, linvel, target)
+        terms["flight"] = view.config.flight * closer / (1.0 + (lacks / FLIGHT).square())
     shaping: Memory = {}
     if view.config.reach > 0.0:
         nearest = torch.minimum(memory["nearest"], foot_distance(view))
@@ -216,6 +230,16 @@ def foot_distance(view: View) -> Tensor:
         length(view.physics.body_pos[:, 0, body.link_index(ankle)] - ball) for ankle in ANKLES
     )
     return torch.minimum(left, right)
+
+
+def velocity_lacking(ball: Tensor, linvel: Tensor, target: Tensor) -> Tensor:
+    """(N,) m/s: the smallest change of velocity after which a ball at ``ball`` (N, 3) that flies
+    freely passes the target (N, 3), after any of ``FLIGHT_TIMES``. On the way there it is, but for
+    the spacing of these times, what it was."""
+    time = constant(FLIGHT_TIMES, ball.device)[:, None]
+    half_g = constant((0.0, 0.0, 0.5 * GRAVITY), ball.device)
+    wanted = (target - ball)[:, None] / time + half_g * time
+    return length(wanted - linvel[:, None]).amin(-1)
 
 
 def predicted_entry(view: View, ball: Tensor, linvel: Tensor) -> tuple[Tensor, Tensor]:
