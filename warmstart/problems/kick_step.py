@@ -22,9 +22,9 @@ from warmstart.transcription import Transcription
 BOTH, LEFT, RIGHT = {"L": "flat", "R": "flat"}, {"L": "flat"}, {"R": "flat"}
 LEAN, STEP, PLANT = (0.20, 0.50), (0.30, 0.45), (0.10, 0.40)
 """Durations (s): both feet load; the left one is in the air; both stand."""
-DURATIONS = (0.20, 0.45, 0.35)
+DURATIONS = (0.50, 0.45, 0.35)
 """The same of a first guess."""
-SLACK = 0.02
+SLACK = 0.002
 """How far a step may be off the asked length (m)."""
 ASIDE = 0.15
 """How far the left foot may land to either side of where it started (m)."""
@@ -33,7 +33,7 @@ LIFT = 0.02
 SLOW, QUIET = 2.0, 30.0
 """Largest rate (rad/s) and acceleration (rad/s^2) of a hinge while both feet stand: see the kick
 from a stand."""
-STILL = 4.0, 30.0
+STILL = 3.0, 25.0
 """Largest acceleration (m/s^2) and angular acceleration (rad/s^2) of a sole that stands: at rest at
 all knots, it must not move to and fro between them."""
 SHORTEST, LONGEST = 0.3, 0.8
@@ -45,7 +45,7 @@ POSITION = {"x": (-1.0, 1.2), "Knee_y": (0.02, 2.0)}
 def phases(knots: Callable[[int], int]) -> list[Phase]:
     """What comes before the swing."""
     return [
-        Phase("lean", knots(22), LEAN, BOTH),
+        Phase("lean", knots(18), LEAN, BOTH),
         Phase("step", knots(20), STEP, RIGHT),
         Phase("plant", knots(18), PLANT, BOTH),
     ]
