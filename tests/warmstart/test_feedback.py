@@ -45,8 +45,8 @@ def test_a_long_horizon_gives_scipys_infinite_one():
     A, B, Q, R = _system(7, 3)
     P = solve_discrete_are(A, B, Q, R)
     expected = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-    many = [np.repeat(x[None], 300, axis=0) for x in (A, B, Q)]
-    found = feedback.riccati(*many, R, np.zeros((7, 7)))
+    As, Bs, Qs = (np.repeat(x[None], 300, axis=0) for x in (A, B, Q))
+    found = feedback.riccati(As, Bs, Qs, R, np.zeros((7, 7)))
     np.testing.assert_allclose(found[0], expected, rtol=1e-9, atol=1e-12)
 
 
@@ -79,8 +79,8 @@ def test_a_mass_on_a_line():
     A, B = feedback.discretised(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), dt)
     np.testing.assert_allclose(A, [[1.0, dt], [0.0, 1.0]], atol=1e-15)
     np.testing.assert_allclose(B, [[dt**2 / 2], [dt]], atol=1e-15)
-    many = [np.repeat(x[None], steps, axis=0) for x in (A, B, np.diag([dt, 0.0]))]
-    gain = feedback.riccati(*many, np.array([[dt]]), np.zeros((2, 2)))
+    As, Bs, Qs = (np.repeat(x[None], steps, axis=0) for x in (A, B, np.diag([dt, 0.0])))
+    gain = feedback.riccati(As, Bs, Qs, np.array([[dt]]), np.zeros((2, 2)))
     np.testing.assert_allclose(gain[0], [[1.0, np.sqrt(2.0)]], rtol=2e-3)
 
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from olympics_opt.report.sections import certificate_section
 from sports.humanoid.mjcf import build_model
 from sports.penalty_kick import SPOT, PenaltyKick, scene
 from sports.soccer import BALL_RADIUS
@@ -137,6 +138,9 @@ def test_it_is_certified_with_feedback_and_says_so(kicked, tmp_path: Path):
     assert found.passed and found.clip is not None
     assert found.clip.meta["source"].endswith("replayed in MuJoCo with feedback")
     assert name_of(kicked) == "penalty_kick_16mps_step_human"
+    (path,) = (p for p in SHIPPED if p.stem == name_of(kicked))  # made of this plan
+    np.testing.assert_allclose(found.clip.qpos, Clip.load(path).qpos, atol=1e-3)
+    assert CLOSED_LOOP in certificate_section(text).text
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "drake"])
