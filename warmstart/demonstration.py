@@ -163,7 +163,7 @@ def _held(played: Replayed, rows: np.ndarray) -> np.ndarray:
 
 
 def name_of(solution: Solution) -> str:
-    """Of a demonstration's file: problem, side of a stroke or kind of punch, outcome, a step before
+    """Of a demonstration's file: problem, side of a stroke or kind of punch, outcome, steps before
     it, strength, style of a jump."""
     problem, options = solution.problem, solution.stats.get("options", {})
     side = options.get("side", options.get("punch"))
@@ -171,6 +171,7 @@ def name_of(solution: Solution) -> str:
     asked = solution.asked[rules.outcome if rules else OUTCOMES[problem].field]
     unit = rules.unit.replace("/", "p") if rules else "m"
     step = ["step"] if options.get("approach") else []
+    step += ["steps"] if options.get("from_start") else []
     words = [problem, *([side] if side else []), f"{asked:g}{unit}", *step, solution.strength]
     if solution.stats.get("style", "tuck") != "tuck":
         words.append(solution.stats["style"])

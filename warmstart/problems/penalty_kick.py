@@ -73,6 +73,8 @@ BESIDE = 0.14
 """How far to the left (m)."""
 FEET = (0.15, 0.30), (0.15, 0.40)
 """How far the left foot stands to the left of and ahead of the right one at the ball (m)."""
+ORIGIN = (SPOT[0] - BEHIND, SPOT[1] + BESIDE)
+"""Where the middle of the feet stands at the ball, in the task's world (m)."""
 SHEAR = 600.0
 """Weight of horizontal force on the feet: those of a split stance would push apart."""
 EVEN = 0.2
@@ -96,6 +98,8 @@ class Config(striker.Config):
     """Where the ball is to pass the goal plane, y and z (m)."""
     approach: float = 0.0
     """Length of a step of the left foot to the ball (m); 0 for a kick from a stand."""
+    from_start: bool = False
+    """Begin as the task does, two steps from the ball; ``approach`` is then left at 0."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -117,6 +121,13 @@ class Config(striker.Config):
                 f"approach must be 0, or a step of {kick_step.SHORTEST:g} to "
                 f"{kick_step.LONGEST:g} m, not {self.approach}"
             )
+        if self.approach and self.from_start:
+            raise ValueError("from_start has its own two steps: leave approach at 0")
+
+    @property
+    def steps(self) -> bool:
+        """Whether it is a kick after a step, which is replayed with feedback."""
+        return self.from_start or self.approach > 0.0
 
 
 def make_event(config: Config, body: Body) -> striker.Event:
@@ -139,21 +150,24 @@ def transcribe(
 ) -> Transcription:
     """The nonlinear program."""
     knots = jumper.scaled(config.detail)
-    steps = config.approach > 0.0
+    steps = config.steps
     stand = [Phase("lean", knots(28), LEAN, LEFT | {"R": "flat"})]
     phases = [
-        *(kick_step.phases(knots) if steps else stand),
+        *(kick_step.phases(knots, config.from_start) if steps else stand),
         Phase("swing", knots(30), SWING, LEFT),
         Phase("follow", knots(10), FOLLOW, LEFT),
     ]
+    position = POSITION | (kick_step.POSITION if steps else {})
+    if config.from_start:
+        position["Knee_y"] = (0.0, 2.0)
     program = striker.transcribe(
         body,
         event,
         phases,
         config,
         free=FREE,
-        pose=POSE,
-        position=POSITION | (kick_step.POSITION if steps else {}),
+        pose={} if config.from_start else POSE,
+        position=position,
         rate=RATE,
         comfort=COMFORT,
         held_limits=jumper.HELD_LIMITS,
@@ -161,7 +175,11 @@ def transcribe(
         shear=SHEAR,
         elastic=elastic,
     )
-    stands = kick_step.rows(program, body, config.approach) if steps else 0
+    stands = kick_step.rows(program, body) if steps else 0
+    if config.from_start:
+        kick_step.as_the_task(program, body, ORIGIN)
+    elif steps:
+        kick_step.of_length(program, config.approach)
     striker.stance(program, body, *FEET, knot=stands)
     keep_apart(program, body, np.arange(program.K))
     air = np.concatenate([program.knots("swing")[1:], program.knots("follow")[1:]])
@@ -223,6 +241,11 @@ def solve(
         asked["approach"] = config.approach
         keys, durations = "penalty_kick_step", (*kick_step.DURATIONS, *DURATIONS[1:])
         what += f" after a step of {config.approach:g} m"
+    elif config.from_start:
+        durations = (*kick_step.START_DURATIONS, *kick_step.DURATIONS, *DURATIONS[1:])
+        keys = "penalty_kick_from_start"
+        asked["steps"] = 2
+        what += " after two steps"
     return striker.solve(
         "penalty_kick",
         asked,
@@ -233,7 +256,7 @@ def solve(
         config,
         progress,
         what,
-        (SPOT[0] - BEHIND, SPOT[1] + BESIDE, 0.0),
+        (*ORIGIN, 0.0),
         target=list(config.target),
-        feedback=config.approach > 0.0,
+        feedback=config.steps,
     )
