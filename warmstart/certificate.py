@@ -108,10 +108,15 @@ OPEN_LOOP, CLOSED_LOOP = (
 
 def required(problem: str, feedback: bool = False) -> dict[str, tuple[str, float, str]]:
     """What a certificate of a problem must list, where its replays are open loop or with feedback;
-    one of an unknown problem cannot pass."""
-    if problem in RULES:
-        return LIMITS | strike.limits(RULES[problem], feedback)
-    return LIMITS | PROBLEM_LIMITS.get(problem, {"problem is known": ("<=", 0.0, "")})
+    one of an unknown problem cannot pass, nor one with feedback where only open loops count."""
+    rules = RULES.get(problem)
+    if rules is None:
+        out = LIMITS | PROBLEM_LIMITS.get(problem, {"problem is known": ("<=", 0.0, "")})
+    else:
+        out = LIMITS | strike.limits(rules, feedback)
+    if feedback and (rules is None or rules.closed is None):
+        out |= {"replay must be open loop": ("<=", 0.0, "")}  # never computed: it fails
+    return out
 
 
 @dataclass(frozen=True)

@@ -199,15 +199,19 @@ def test_what_hands_hold_is_not_followed():
             feedback.follow(Solution.load(DATA / f"{name}.npz"))
 
 
-def test_the_gate_takes_feedback_only_where_the_rules_do(kick, monkeypatch):
-    """A stroke of tennis cannot be helped by it: its gate asks for an open loop."""
+@pytest.mark.parametrize("name", ["tennis_24_human", "high_jump_1.0_human"])
+def test_the_gate_refuses_feedback_where_the_rules_ask_for_an_open_loop(name, monkeypatch):
     monkeypatch.setattr("warmstart.certificate._replay", lambda *_: {})
-    stroke = Solution.load(DATA / "tennis_24_human.npz")
-    found = certify(replace(stroke, stats=stroke.stats | {FEEDBACK: True}))
+    motion = Solution.load(DATA / f"{name}.npz")
+    found = certify(replace(motion, stats=motion.stats | {FEEDBACK: True}))
     assert not found.passed
     assert any("replay must be open loop" in f for f in found.failures)
-    assert "replay must be open loop" not in required("tennis")
-    assert certify(stroke).stats["replay"] == OPEN_LOOP
+    assert "replay must be open loop" not in required(motion.problem)
+    assert certify(motion).stats["replay"] == OPEN_LOOP
+
+
+def test_the_gate_takes_feedback_in_a_kick_and_asks_for_more(kick, monkeypatch):
+    monkeypatch.setattr("warmstart.certificate._replay", lambda *_: {})
     assert certify(kick).stats["replay"] == CLOSED_LOOP
     more = set(required("penalty_kick", feedback=True)) - set(required("penalty_kick"))
     assert {"replay in drake: feedback torque", "replay in mujoco: step"} <= more
