@@ -145,7 +145,8 @@ def table(results: list[Result], problems: dict[str, Any]) -> Any:
     out = plain_table(
         *("problem", "solve\n(s)", "iterations", "violation", "asked", "achieved\nin MuJoCo"),
         *("achieved\nin Drake", "tracked\nin MuJoCo", "Drake\n+ SNOPT", "verdict"),
-        caption="achieved: the torques replayed open loop; tracked: with feedback",
+        caption="achieved: the torques replayed open loop (a kick after a step: with feedback); "
+        "tracked: with feedback",
     )
     for r in results:
         unit = problems[r.problem].unit

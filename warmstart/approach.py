@@ -6,7 +6,8 @@ steps, then the left one, at rest in the kick's first pose; feet land and leave 
 Played open loop they drift by 8 cm in 1.8 s, and from the task's start, on stiff legs, they fall.
 So steps and kick are followed together in closed loop (:mod:`warmstart.tracking`), from the task's
 own start, and the task's rules say what came of it. There is no certificate of the steps: what
-counts is the episode that MuJoCo played.
+counts is the episode that MuJoCo played. A kick after one step that both engines certify is an
+option of the problem itself (``approach``).
 
 ``python -m warmstart.approach KICK.npz --out CLIP.npz``
 """

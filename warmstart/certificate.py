@@ -4,7 +4,8 @@ The optimiser says a motion is feasible at its knots, by its own equations. Here
 the knots is sampled five times finer and everything is computed again from other sources: inverse
 dynamics by MuJoCo's and by Drake's own algorithms on models built from the body table, geometry by
 MuJoCo's collision routines, contact from the links' own motion, and at last both engines replay
-the torques. What is missing, not finite or could not be computed fails.
+the torques: open loop, unless the certificate says that feedback was used (``stats["replay"]``).
+What is missing, not finite or could not be computed fails.
 
 Between knots the motion is the one of :meth:`Solution.sample`: joint accelerations, torques and
 forces linear in time, so positions are cubics. That is what the trapezoid rule on accelerations
@@ -40,7 +41,7 @@ from warmstart.inverse_dynamics import (
 )
 from warmstart.judged import RULES
 from warmstart.outcome import OUTCOMES, support
-from warmstart.replay import replay
+from warmstart.replay import FEEDBACK, replay
 from warmstart.solution import Solution
 
 FINER = 5
@@ -97,11 +98,25 @@ PROBLEM_LIMITS: dict[str, dict[str, tuple[str, float, str]]] = {
 }
 
 
-def required(problem: str) -> dict[str, tuple[str, float, str]]:
-    """What a certificate of a problem must list; one of an unknown problem cannot pass."""
-    if problem in RULES:
-        return LIMITS | strike.limits(RULES[problem])
-    return LIMITS | PROBLEM_LIMITS.get(problem, {"problem is known": ("<=", 0.0, "")})
+OPEN_LOOP, CLOSED_LOOP = (
+    "open loop: the planned torques",
+    "closed loop: the planned torques and linear feedback of the simulated state, with the same "
+    "gains in both engines (warmstart/feedback.py)",
+)
+"""What a certificate says of its replays (``stats["replay"]``)."""
+
+
+def required(problem: str, feedback: bool = False) -> dict[str, tuple[str, float, str]]:
+    """What a certificate of a problem must list, where its replays are open loop or with feedback;
+    one of an unknown problem cannot pass, nor one with feedback where only open loops count."""
+    rules = RULES.get(problem)
+    if rules is None:
+        out = LIMITS | PROBLEM_LIMITS.get(problem, {"problem is known": ("<=", 0.0, "")})
+    else:
+        out = LIMITS | strike.limits(rules, feedback)
+    if feedback and (rules is None or rules.closed is None):
+        out |= {"replay must be open loop": ("<=", 0.0, "")}  # never computed: it fails
+    return out
 
 
 @dataclass(frozen=True)
@@ -146,7 +161,7 @@ class Certificate:
     @property
     def required(self) -> dict[str, tuple[str, float, str]]:
         """What a certificate of this problem must list."""
-        return required(self.problem)
+        return required(self.problem, bool(self.stats.get(FEEDBACK)))
 
     @property
     def passed(self) -> bool:
@@ -253,11 +268,16 @@ def certify(solution: Solution) -> Certificate:
             figures |= compute()
         except Exception as error:  # fail-closed: whatever goes wrong, the check is missing
             broken.append(f"{name}: {type(error).__name__}: {error}")
+    feedback = bool(solution.stats.get(FEEDBACK))
+    listed = required(solution.problem, feedback)
+    if feedback:
+        notes |= {name: "with feedback" for name in listed if name.startswith("replay in ")}
     checks = tuple(
         Check(name, float(figures.get(name, math.nan)), sense, limit, unit, notes.get(name, ""))
-        for name, (sense, limit, unit) in required(solution.problem).items()
+        for name, (sense, limit, unit) in listed.items()
     )
     stats = {k: v for k, v in solution.stats.items() if isinstance(v, int | float | str | bool)}
+    stats["replay"] = CLOSED_LOOP if feedback else OPEN_LOOP
     return Certificate(
         problem=solution.problem,
         asked=dict(solution.asked),

@@ -20,7 +20,7 @@ from warmstart.clip import Clip, clip_from_solution
 from warmstart.judged import RULES
 from warmstart.outcome import OUTCOMES, link_poses
 from warmstart.refine import Search, refine
-from warmstart.replay import REPLAY_RATE, replay_states
+from warmstart.replay import FEEDBACK, REPLAY_RATE, Replayed, replay_all
 from warmstart.solution import Solution
 from warmstart.tracking import Tracking, track_best
 
@@ -111,10 +111,12 @@ def _thrown(
 def strike_clip(solution: Solution, certificate: Certificate, fps: float = 60.0) -> Clip:
     """The replay of a certified strike or throw in MuJoCo as a clip, labelled with its figures.
 
-    ``ctrl`` are the targets averaged over each frame. Raises RuntimeError when it diverges.
+    ``ctrl`` are the targets averaged over each frame, with what feedback added. Raises
+    RuntimeError when it diverges.
     """
     planned = clip_from_solution(solution, fps)
-    times, qpos, qvel = replay_states(solution, "mujoco", hold=0.0)
+    played = replay_all(solution, "mujoco", hold=0.0)
+    times, qpos, qvel = played.times, played.qpos, played.qvel
     rows = np.round(planned.times * REPLAY_RATE).astype(int)
     rows = rows[rows < len(times)]
     assert planned.ctrl is not None
@@ -133,7 +135,8 @@ def strike_clip(solution: Solution, certificate: Certificate, fps: float = 60.0)
     event, options = solution.stats["event"], solution.stats.get("options", {})
     meta = {
         **planned.meta,
-        "source": "trajectory optimisation, replayed in MuJoCo",
+        "source": "trajectory optimisation, replayed in MuJoCo"
+        + (" with feedback" if solution.stats.get(FEEDBACK) else ""),
         "achieved": {k: round(v, 6) for k, v in achieved.items()},
         "options": options,
         "events": {"strike" if RULES[solution.problem].nearest else "release": event["time"]},
@@ -146,20 +149,30 @@ def strike_clip(solution: Solution, certificate: Certificate, fps: float = 60.0)
         planned,
         qpos=qpos[rows, :width],
         qvel=qvel[rows, : width - 1],
-        ctrl=planned.ctrl[: len(rows)],
+        ctrl=planned.ctrl[: len(rows)] + _held(played, rows) / solution.body.array("kp"),
         meta=meta,
     )
 
 
+def _held(played: Replayed, rows: np.ndarray) -> np.ndarray:
+    """(F, n) mean torque of feedback (N m) from each row of a replay to the next one."""
+    ends = np.append(rows[1:], len(played.feedback))
+    pairs = zip(rows, ends, strict=True)
+    none = np.zeros(played.feedback.shape[1])
+    return np.array([played.feedback[a:b].mean(0) if b > a else none for a, b in pairs])
+
+
 def name_of(solution: Solution) -> str:
-    """Of a demonstration's file: problem, side of a stroke or kind of punch, outcome, strength,
-    style of a jump."""
+    """Of a demonstration's file: problem, side of a stroke or kind of punch, outcome, steps before
+    it, strength, style of a jump."""
     problem, options = solution.problem, solution.stats.get("options", {})
     side = options.get("side", options.get("punch"))
     rules = RULES.get(problem)
     asked = solution.asked[rules.outcome if rules else OUTCOMES[problem].field]
     unit = rules.unit.replace("/", "p") if rules else "m"
-    words = [problem, *([side] if side else []), f"{asked:g}{unit}", solution.strength]
+    step = ["step"] if options.get("approach") else []
+    step += ["steps"] if options.get("from_start") else []
+    words = [problem, *([side] if side else []), f"{asked:g}{unit}", *step, solution.strength]
     if solution.stats.get("style", "tuck") != "tuck":
         words.append(solution.stats["style"])
     return "_".join(words)

@@ -44,7 +44,7 @@ ADVICE: dict[str, str] = {
     "replay in drake: lowest but feet": "the athlete falls in the replay: ask for less",
     "replay in mujoco: opponent": "the weapon does not touch the opponent: raise detail",
     "replay in drake: opponent": "the weapon does not touch the opponent: raise detail",
-    "replay in": "played open loop the motion misses: raise detail, so that the torques between "
+    "replay in": "replayed, the motion misses: raise detail, so that the torques between "
     "the knots are closer to those that are needed",
 }
 """What to try, by the beginning of a check's name."""

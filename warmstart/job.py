@@ -77,7 +77,8 @@ class Result:
     start: str = ""
     """Name of the solution that it started from; empty for the problem's own start."""
     achieved: dict[str, float] = field(default_factory=dict)
-    """``planned``, ``replay_mujoco``, ``replay_drake`` (open loop, from the certificate) and
+    """``planned``, ``replay_mujoco``, ``replay_drake`` (from the certificate, which says
+    whether they are open loop) and
     ``tracked`` (with feedback, in MuJoCo), in the problem's unit; 0 for no valid attempt."""
     figures: dict[str, float] = field(default_factory=dict)
     """Those of :func:`warmstart.measure.figures`."""

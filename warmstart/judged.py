@@ -15,6 +15,7 @@ from sports.rackets import Game
 from sports.scene import Scene
 from warmstart import duel, held_ball, kick, shot, tee_shot, thrown
 from warmstart.outcome import link_poses
+from warmstart.replay import Replayed
 from warmstart.solution import Solution
 from warmstart.strike import Moment, Rules
 
@@ -208,6 +209,23 @@ def _before_the_ball(solution: Solution) -> dict[str, float]:
     return {"planned depth in the ball before the impact": depth}
 
 
+def _approached(solution: Solution, played: Replayed) -> dict[str, float]:
+    """Of a kick with a step: how far (m) the left foot has come when the ball is kicked, whether
+    the athlete stays on its feet while the plan lasts, and the largest torque that feedback asked
+    for, over its limit."""
+    body = solution.body
+    until = played.times <= solution.duration
+    pos, _ = link_poses(body, played.qpos[until])
+    foot = pos[:, body.link_index("L_Ankle"), :2]
+    at = int(np.searchsorted(played.times, solution.stats["event"]["time"]))
+    share = np.abs(played.feedback) / body.array("effort")
+    return {
+        "step": float(np.linalg.norm(foot[at] - foot[0])),
+        "feedback torque": float(share.max()),
+        **on_its_feet(solution, played.qpos[until]),
+    }
+
+
 def _penalty_kick() -> Rules:
     checks: Checks = {
         "planned depth in the ball before the impact": ("<=", 0.002, "m"),
@@ -231,6 +249,16 @@ def _penalty_kick() -> Rules:
         play=kick.played,
         also=_before_the_ball,
         checks=checks,
+        closed=_approached,
+        closed_checks={
+            f"{head}{name}": limit
+            for head in _REPLAYS
+            for name, limit in (
+                ("step", (">=", 0.2, "m")),
+                ("lowest but feet", (">=", 0.15, "m")),
+                ("feedback torque", (*_RECORDED, "of the limit")),
+            )
+        },
     )
 
 

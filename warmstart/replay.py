@@ -1,13 +1,15 @@
 """A motion put back into simulation: a solution's torques, a clip's targets.
 
-:func:`replay` plays a solution open loop on any engine; :func:`play` plays a clip in its task's
-environment, where the task's own rules measure what it achieves.
+:func:`replay` plays a solution on any engine, open loop, or with the feedback of
+:mod:`warmstart.feedback` where the solution says so (``stats["feedback"]``); :func:`play` plays a
+clip in its task's environment, where the task's own rules measure what it achieves.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,14 +24,33 @@ from warmstart.clip import Clip
 from warmstart.solution import Solution
 
 REPLAY_RATE = 480.0
-"""Control and simulation rate of an open-loop replay (Hz)."""
+"""Control and simulation rate of a solution's replay (Hz)."""
+FEEDBACK = "feedback"
+"""Key of a solution's stats: whether it is replayed in closed loop."""
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What an engine made of a solution, of a scene's athlete and its free objects."""
+
+    times: np.ndarray
+    """(T + 1,) s from the first frame."""
+    qpos: np.ndarray
+    """(T + 1, nq)"""
+    qvel: np.ndarray
+    """(T + 1, nv)"""
+    ctrl: np.ndarray
+    """(T, num_dofs) targets of the servos in each step (rad)."""
+    feedback: np.ndarray
+    """(T, num_dofs) what feedback asked for beyond the plan (N m); zero in an open loop."""
 
 
 def replay(
     solution: Solution, engine: str, hold: float = 0.5, scene: Scene | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Plays the torques open loop at ``REPLAY_RATE``: targets q + torque / kp, clipped by the
-    servo, then the last targets for ``hold`` s. The athlete is alone on the ground.
+    """Plays the torques at ``REPLAY_RATE``: targets q + torque / kp, clipped by the servo, then the
+    last targets for ``hold`` s. The athlete is alone on the ground. Open loop, unless the solution
+    asks for feedback: then that is added to the torques while the plan lasts.
 
     Returns times (T,) s from the first frame and qpos (T, 7 + n). Raises RuntimeError when the
     simulation diverges.
@@ -50,6 +71,20 @@ def replay_states(
     ``objects``: qpos and qvel of the scene's free objects at the first frame, one after the other;
     theirs follow the athlete's in what is returned.
     """
+    played = replay_all(solution, engine, hold, scene, objects)
+    return played.times, played.qpos, played.qvel
+
+
+def replay_all(
+    solution: Solution,
+    engine: str,
+    hold: float = 0.5,
+    scene: Scene | None = None,
+    objects: tuple[np.ndarray, np.ndarray] | None = None,
+    start: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Replayed:
+    """The same with what the servos were given. ``start``: qpos and qvel of the athlete in place
+    of the plan's first ones."""
     scene = scene or humanoid_scene(solution.body)
     planned = math.floor(solution.duration * REPLAY_RATE)
     steps = planned + round(hold * REPLAY_RATE)
@@ -57,13 +92,31 @@ def replay_states(
     motion = solution.sample(solution.times[0] + middle)
     targets = motion["qpos"][:, 7:] + motion["torque"] / solution.body.array("kp")
     things = objects or (np.zeros(0), np.zeros(0))
-    qpos = [np.concatenate([solution.qpos[0], things[0]])]
-    qvel = [np.concatenate([solution.qvel[0], things[1]])]
+    own = start or (solution.qpos[0], solution.qvel[0])
+    qpos, qvel = ([np.concatenate([mine, its])] for mine, its in zip(own, things, strict=True))
+    correct = _corrections(solution)
     held = int((solution.loaded(middle) > 0.5).sum())
-    _play(engine, scene, targets[:held], qpos, qvel)
+    added = _play(engine, scene, targets[:held], qpos, qvel, correct)
     if held < steps:  # what was thrown is no longer in the hand
-        _play(engine, replace(scene, body=solution.empty_handed), targets[held:], qpos, qvel)
-    return np.arange(len(qpos)) / REPLAY_RATE, np.array(qpos), np.array(qvel)
+        empty = replace(scene, body=solution.empty_handed)
+        added += _play(engine, empty, targets[held:], qpos, qvel, correct)
+    feedback = np.array(added).reshape(steps, -1)
+    ctrl = targets + feedback / solution.body.array("kp")
+    return Replayed(
+        np.arange(len(qpos)) / REPLAY_RATE, np.array(qpos), np.array(qvel), ctrl, feedback
+    )
+
+
+_Correct = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
+
+
+def _corrections(solution: Solution) -> _Correct | None:
+    """Torques beyond the plan (n,) by step and state; None in an open loop."""
+    if not solution.stats.get(FEEDBACK):
+        return None
+    from warmstart.feedback import follow
+
+    return follow(solution).torque
 
 
 def _play(
@@ -72,8 +125,10 @@ def _play(
     targets: np.ndarray,
     qpos: list[np.ndarray],
     qvel: list[np.ndarray],
-) -> None:
-    """Appends what an engine makes of the targets (T, n) from the last state in the lists."""
+    correct: _Correct | None = None,
+) -> list[np.ndarray]:
+    """Appends what an engine makes of the targets (T, n) from the last state in the lists; returns
+    the torques that were added to them (T, n)."""
     scene = replace(scene, timestep=1.0 / REPLAY_RATE, substeps=1)
     physics = make_physics(engine, scene, 1)
     state = PhysicsState(
@@ -84,13 +139,19 @@ def _play(
     physics.reset(torch.ones(1, dtype=torch.bool), state)
     qpos[-1] = physics.qpos[0].double().numpy().copy()
     qvel[-1] = physics.qvel[0].double().numpy().copy()
+    added, (wide, kp) = [], (scene.body.num_dofs, scene.body.array("kp"))
     for target in targets:
-        physics.step(torch.tensor(target[None], dtype=torch.float32))
+        extra = np.zeros(wide)
+        if correct is not None:
+            extra = correct(len(qpos) - 1, qpos[-1][: 7 + wide], qvel[-1][: 6 + wide])
+        added.append(extra)
+        physics.step(torch.tensor((target + extra / kp)[None], dtype=torch.float32))
         if bool(physics.bad.any()):
             raise RuntimeError(f"the replay diverged in {engine} after {len(qpos)} steps")
         qpos.append(physics.qpos[0].double().numpy().copy())
         qvel.append(physics.qvel[0].double().numpy().copy())
     physics.close()
+    return added
 
 
 _OPTIONS = {"high_jump": {"bar_height": "bar_height"}, "hurdling": {"hurdle_height": "height"}}

@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 from sports.humanoid.body import Body
 from warmstart import rotation
 from warmstart.outcome import link_poses
-from warmstart.replay import replay_states
+from warmstart.replay import FEEDBACK, Replayed, replay_all
 from warmstart.solution import Solution
 
 AROUND = 0.06
@@ -120,10 +120,14 @@ class Rules:
     """Figures of the whole planned motion."""
     checks: Mapping[str, tuple[str, float, str]] = field(default_factory=dict)
     """Checks of what ``follow``, ``whole`` and ``play`` find: sense, limit, unit."""
+    closed: Callable[[Solution, Replayed], dict[str, float]] | None = None
+    """Figures of a replay in closed loop; None where only open loops count."""
+    closed_checks: Mapping[str, tuple[str, float, str]] = field(default_factory=dict)
+    """Checks of what ``closed`` finds."""
 
 
-def limits(rules: Rules) -> dict[str, tuple[str, float, str]]:
-    """Checks of a certificate: sense, limit, unit."""
+def limits(rules: Rules, feedback: bool = False) -> dict[str, tuple[str, float, str]]:
+    """Checks of a certificate, of an open loop or one with feedback: sense, limit, unit."""
     out: dict[str, tuple[str, float, str]] = {
         "planned outcome": (">=", 0.0, rules.unit),
         "planned miss": ("<=", 0.002, "m"),
@@ -142,7 +146,7 @@ def limits(rules: Rules) -> dict[str, tuple[str, float, str]]:
             out[f"replay in {engine}: face off"] = ("recorded", np.nan, "deg")
         else:
             out[f"replay in {engine}: direction off"] = ("<=", 3.0, "deg")
-    return out | dict(rules.checks)
+    return out | (dict(rules.closed_checks) if feedback else {}) | dict(rules.checks)
 
 
 def planned(rules: Rules, solution: Solution, times: np.ndarray) -> dict[str, float]:
@@ -166,7 +170,8 @@ def replayed(
 ) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
     """A replay in an engine: its times (T,) s, its frames (T, 7 + n) and its figures."""
     event = solution.stats["event"]
-    times, qpos, _ = replay_states(solution, engine, hold=0.1)
+    played = replay_all(solution, engine, hold=0.1)
+    times, qpos = played.times, played.qpos
     found = moment(solution.body, event, times, qpos, rules.nearest)
     head = f"replay in {engine}: "
     out = {
@@ -181,6 +186,8 @@ def replayed(
         out |= {f"{head}{name}": value for name, value in rules.whole(solution, qpos).items()}
     if rules.play is not None:
         out |= {f"{head}{name}": value for name, value in rules.play(solution, engine).items()}
+    if solution.stats.get(FEEDBACK) and rules.closed is not None:
+        out |= {f"{head}{name}": value for name, value in rules.closed(solution, played).items()}
     return times, qpos, out
 
 

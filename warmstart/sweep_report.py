@@ -20,12 +20,13 @@ SHOWN = 4
 
 
 def table(results: Sequence[Result], field: str, unit: str = "") -> Table:
-    """The results as a rich table, one row a value; the outcomes of replays are open loop."""
+    """The results as a rich table, one row a value."""
     of = f"\n({unit})" if unit else ""
     out = plain_table(
         *(field, f"asked{of}", f"planned{of}", f"MuJoCo{of}", f"Drake{of}", f"tracked{of}"),
         *("effort\n(s)", "peak torque\n(N m)", "solve\n(s)", "violation", "verdict"),
-        caption="MuJoCo, Drake: the torques replayed open loop; tracked: with feedback, in MuJoCo",
+        caption="MuJoCo, Drake: the torques replayed open loop (a kick after a step: with "
+        "feedback); tracked: with feedback, in MuJoCo",
     )
     for r in results:
         achieved = [
@@ -110,8 +111,8 @@ def plot(results: Sequence[Result], field: str, problem: Any, path: Path) -> Pat
         line(axes[1], lambda r, name=name: r.peaks.get(name), name.replace("_", " "))
     axes[1].set(title="Largest torques", ylabel="N m")
     axes[1].set_ylim(0, 1.1 * axes[1].get_ylim()[1])
-    names = {"planned": "planned", "replay_mujoco": "MuJoCo, open loop"}
-    names |= {"replay_drake": "Drake, open loop", "tracked": "MuJoCo, with feedback"}
+    names = {"planned": "planned", "replay_mujoco": "MuJoCo, replayed"}
+    names |= {"replay_drake": "Drake, replayed", "tracked": "MuJoCo, tracked"}
     for name, label in names.items():
         if any(name in r.achieved for r in moved):
             line(axes[2], lambda r, name=name: r.achieved.get(name) or None, label)

@@ -90,11 +90,13 @@ def certificate_section(certificate: Mapping[str, Any], title: str = "Certificat
     ]
     tones: dict[int, Tone] = {i: "good" if c["passed"] else "bad" for i, c in enumerate(checks)}
     table = Table(["check", "value", "limit", "unit", "passed"], rows, tones=tones)
+    replays = certificate.get("stats", {}).get("replay")
     return Section(
         title,
         [verdict, table],
         "What the optimiser returned is recomputed by other code, in two engines, on a finer "
-        "grid. A motion that fails one check is not used.",
+        "grid. A motion that fails one check is not used."
+        + (f" Replays are {replays}." if replays else ""),
     )
 
 

@@ -24,7 +24,7 @@ from warmstart.demonstration import name_of, strike_clip
 from warmstart.inverse_dynamics import inverse_dynamics_drake, inverse_dynamics_mujoco
 from warmstart.judged import RULES
 from warmstart.problems import boxing, fencing, guard, jumper, striker
-from warmstart.replay import body_of
+from warmstart.replay import Replayed, body_of
 from warmstart.solution import Solution
 
 DATA = Path(__file__).parent / "data"
@@ -244,9 +244,11 @@ def test_falls_and_lunges_without_a_step_are_refused(lunge, monkeypatch):
 
     def fake(times: np.ndarray, qpos: np.ndarray):
         def states(solution, engine, hold=0.5, scene=None, objects=None):
-            return times, qpos, np.zeros((len(qpos), qpos.shape[1] - 1))
+            rest = np.zeros((len(qpos) - 1, solution.body.num_dofs))
+            rates = np.zeros((len(qpos), qpos.shape[1] - 1))
+            return Replayed(times, qpos, rates, rest, rest)
 
-        monkeypatch.setattr(strike, "replay_states", states)
+        monkeypatch.setattr(strike, "replay_all", states)
 
     t = np.arange(0.0, lunge.duration, 1 / 480)
     planned = lunge.sample(t)["qpos"]

@@ -143,7 +143,7 @@ PROBLEMS: dict[str, Problem] = {
         ),
         Problem(
             name="penalty_kick",
-            summary="kick of the ball from a stand to a target in the goal",
+            summary="kick of the ball, from a stand or after a step, to a target in the goal",
             outcome="ball_speed",
             unit="m/s",
             sweep=(15.0, 16.0, 17.0),

@@ -1,16 +1,20 @@
-"""Penalty kick from a stand: the ball into the goal, at a given speed to a target.
+"""Penalty kick: the ball into the goal, at a given speed to a target.
 
-The athlete stands at rest with the left foot beside the ball and the right one behind, lifts the
-right foot slowly off the ground, swings it back and kicks; the left foot stays where it stands. The
-front of the toes meets the ball: a ball without friction leaves along the face that hits it, so the
-face points where the ball shall go and the foot moves along it. The speed of the foot follows from
-that of the ball by Newton's restitution with the foot's effective mass (:mod:`warmstart.kick`). The
-plan does not know the blow of the ball, which comes after the event and is felt in the replays.
+From a stand: the athlete is at rest with the left foot beside the ball and the right one behind,
+lifts the right foot slowly off the ground, swings it back and kicks; the left foot stays where it
+stands. Or after one step (``approach``): the left foot starts behind and lands beside the ball
+(:mod:`warmstart.problems.kick_step`); such a kick is replayed with feedback.
+
+The front of the toes meets the ball: a ball without friction leaves along the face that hits it, so
+the face points where the ball shall go and the foot moves along it. The speed of the foot follows
+from that of the ball by Newton's restitution with the foot's effective mass
+(:mod:`warmstart.kick`). The plan does not know the blow of the ball, which comes after the event
+and is felt in the replays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -21,7 +25,7 @@ from sports.penalty_kick import SPOT, TARGET_HIGH, TARGET_LOW
 from sports.soccer import BALL_RADIUS
 from warmstart import kick
 from warmstart.phases import Phase
-from warmstart.problems import jumper, striker
+from warmstart.problems import jumper, kick_step, striker
 from warmstart.separation import axis_balls, keep_apart
 from warmstart.solution import Solution
 from warmstart.transcription import Transcription
@@ -67,6 +71,10 @@ BEHIND = 0.62
 """How far the middle of the feet stands behind the ball (m)."""
 BESIDE = 0.14
 """How far to the left (m)."""
+FEET = (0.15, 0.30), (0.15, 0.40)
+"""How far the left foot stands to the left of and ahead of the right one at the ball (m)."""
+ORIGIN = (SPOT[0] - BEHIND, SPOT[1] + BESIDE)
+"""Where the middle of the feet stands at the ball, in the task's world (m)."""
 SHEAR = 600.0
 """Weight of horizontal force on the feet: those of a split stance would push apart."""
 EVEN = 0.2
@@ -88,6 +96,10 @@ class Config(striker.Config):
     """Speed of the ball right after the impact (m/s)."""
     target: tuple[float, float] = (0.8, 0.8)
     """Where the ball is to pass the goal plane, y and z (m)."""
+    approach: float = 0.0
+    """Length of a step of the left foot to the ball (m); 0 for a kick from a stand."""
+    from_start: bool = False
+    """Begin as the task does, two steps from the ball; ``approach`` is then left at 0."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -104,6 +116,18 @@ class Config(striker.Config):
                     f"target {name} must lie between {low:g} and {high:g} m, not {value}"
                 )
         kick.direction(self.ball_speed, self.target)
+        if self.approach and not kick_step.SHORTEST <= self.approach <= kick_step.LONGEST:
+            raise ValueError(
+                f"approach must be 0, or a step of {kick_step.SHORTEST:g} to "
+                f"{kick_step.LONGEST:g} m, not {self.approach}"
+            )
+        if self.approach and self.from_start:
+            raise ValueError("from_start has its own two steps: leave approach at 0")
+
+    @property
+    def steps(self) -> bool:
+        """Whether it is a kick after a step, which is replayed with feedback."""
+        return self.from_start or self.approach > 0.0
 
 
 def make_event(config: Config, body: Body) -> striker.Event:
@@ -126,26 +150,37 @@ def transcribe(
 ) -> Transcription:
     """The nonlinear program."""
     knots = jumper.scaled(config.detail)
+    steps = config.steps
+    stand = [Phase("lean", knots(28), LEAN, LEFT | {"R": "flat"})]
     phases = [
-        Phase("lean", knots(28), LEAN, LEFT | {"R": "flat"}),
+        *(kick_step.phases(knots, config.from_start) if steps else stand),
         Phase("swing", knots(30), SWING, LEFT),
         Phase("follow", knots(10), FOLLOW, LEFT),
     ]
+    position = POSITION | (kick_step.POSITION if steps else {})
+    if config.from_start:
+        position["Knee_y"] = (0.0, 2.0)
     program = striker.transcribe(
         body,
         event,
         phases,
         config,
         free=FREE,
-        pose=POSE,
-        position=POSITION,
+        pose={} if config.from_start else POSE,
+        position=position,
         rate=RATE,
         comfort=COMFORT,
         held_limits=jumper.HELD_LIMITS,
-        feet=((0.15, 0.30), (0.15, 0.40)),
+        feet=None,
         shear=SHEAR,
         elastic=elastic,
     )
+    stands = kick_step.rows(program, body) if steps else 0
+    if config.from_start:
+        kick_step.as_the_task(program, body, ORIGIN)
+    elif steps:
+        kick_step.of_length(program, config.approach)
+    striker.stance(program, body, *FEET, knot=stands)
     keep_apart(program, body, np.arange(program.K))
     air = np.concatenate([program.knots("swing")[1:], program.knots("follow")[1:]])
     swing, sole = program.knots("swing"), jumper.foot(body, "R")
@@ -154,9 +189,10 @@ def transcribe(
     program.ground(sole, high, margin=SWEEP)
     program.ground(sole, swing[-2:], margin=LOW)
     _evenly(program)
-    _off_the_ball(program, body)
-    program.bound(program.v[program.knots("lean"), 6:], -SLOW, SLOW)
-    program.bound(program.a[program.knots("lean"), 6:], -QUIET, QUIET)
+    _off_the_ball(program, body, [*program.knots("step")[-6:]] if steps else [0])
+    if not steps:
+        program.bound(program.v[program.knots("lean"), 6:], -SLOW, SLOW)
+        program.bound(program.a[program.knots("lean"), 6:], -QUIET, QUIET)
     for side in "LR":  # at rest at all knots, it must not accelerate to and fro between them
         program.fix(program.a[0, program.model.index(f"{side}_Toe_y")], 0.0)
     return program
@@ -171,7 +207,7 @@ def _evenly(program: Transcription) -> None:
         )
 
 
-def _off_the_ball(program: Transcription, body: Body) -> None:
+def _off_the_ball(program: Transcription, body: Body, knots: Sequence[int]) -> None:
     """The left leg keeps off the ball."""
     model = program.model
     balls = [b for link in ("Knee", "Ankle", "Toe") for b in axis_balls(body, f"L_{link}")]
@@ -186,7 +222,7 @@ def _off_the_ball(program: Transcription, body: Body) -> None:
         ]
         return [("off the ball", ca.vertcat(*gaps) / 0.05, 0.0, np.inf)]
 
-    program.rows("off the ball", [0], off)
+    program.rows("off the ball", knots, off)
 
 
 def solve(
@@ -197,16 +233,30 @@ def solve(
     """The least-effort kick. See :meth:`warmstart.problems.Problem.solve`."""
     body = load_body("smpl", strength=config.strength)
     event = make_event(config, body)
+    asked, keys, durations = {"ball_speed": config.ball_speed}, "penalty_kick", DURATIONS
+    what = (
+        f"a kick of {config.ball_speed:g} m/s (foot {kick.foot_speed(config.ball_speed):.1f} m/s)"
+    )
+    if config.approach:
+        asked["approach"] = config.approach
+        keys, durations = "penalty_kick_step", (*kick_step.DURATIONS, *DURATIONS[1:])
+        what += f" after a step of {config.approach:g} m"
+    elif config.from_start:
+        durations = (*kick_step.START_DURATIONS, *kick_step.DURATIONS, *DURATIONS[1:])
+        keys = "penalty_kick_from_start"
+        asked["steps"] = 2
+        what += " after two steps"
     return striker.solve(
         "penalty_kick",
-        {"ball_speed": config.ball_speed},
+        asked,
         event,
         lambda elastic: transcribe(config, body, event, elastic),
-        lambda program: striker.key_guess(program, "penalty_kick", DURATIONS),
+        lambda program: striker.key_guess(program, keys, durations),
         guess,
         config,
         progress,
-        f"a kick of {config.ball_speed:g} m/s (foot {kick.foot_speed(config.ball_speed):.1f} m/s)",
-        (SPOT[0] - BEHIND, SPOT[1] + BESIDE, 0.0),
+        what,
+        (*ORIGIN, 0.0),
         target=list(config.target),
+        feedback=config.steps,
     )

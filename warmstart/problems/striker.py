@@ -304,9 +304,13 @@ def rest(program: Transcription, end_rate: float = 2.5) -> None:
 
 
 def stance(
-    program: Transcription, body: Body, apart: tuple[float, float], ahead: tuple[float, float]
+    program: Transcription,
+    body: Body,
+    apart: tuple[float, float],
+    ahead: tuple[float, float],
+    knot: int = 0,
 ) -> None:
-    """The feet at the first knot: the left one ``apart`` (m) to the left of and ``ahead`` (m) of
+    """The feet at a knot: the left one ``apart`` (m) to the left of and ``ahead`` (m) of
     the right one; the athlete between them."""
     model = program.model
     ankles = [model.tree.link(f"{side}_Ankle") for side in "LR"]
@@ -320,7 +324,7 @@ def stance(
             ("between the feet", (left + right)[:2] / 2, -0.02, 0.02),
         ]
 
-    program.rows("stance", [0], feet)
+    program.rows("stance", [knot], feet)
 
 
 def key_guess(program: Transcription, name: str, durations: Sequence[float]) -> np.ndarray:
