@@ -51,8 +51,8 @@ LEGS = tuple(f"{side}_{link}" for side in "LR" for link in ("Hip", "Knee", "Ankl
 ANKLES = ("L_Ankle", "R_Ankle")
 FLIGHT_TIMES = tuple(2.5 / 1.1**k for k in range(45))
 """Of the free flights to the target that ``flight`` compares with (s), 2.5 to 0.04."""
-FLIGHT = 3.0
-"""Width of the reward ``flight`` (m/s)."""
+FLIGHT_SECONDS = 0.2
+"""After the first touch, in which ``flight`` is paid: later a ball that rolls lacks less, too."""
 LEAST_GAIN = 1e-3
 """Metres in a control step; less is no approach of the ball to its target."""
 REST_SPEED, REST_SECONDS = 0.1, 0.5
@@ -72,10 +72,10 @@ class PenaltyKick:
     of the goal is further from a target than the paper's width can be felt: a kicker that shoots
     at the middle learns more from 1 or 2."""
     flight: float = 0.0
-    """Reward in each step in which the ball gets closer, halved where its velocity is ``FLIGHT``
-    away from one that would let it fly through the target; 0 for the paper's terms alone. A ball on
-    the ground earns them without end: kicked a little upward or faster it stays there, so nothing
-    leads from it to a ball that flies."""
+    """Reward for each metre a second by which the ball, kicked, has come nearer than ever to a
+    velocity at which it would fly through its target, within ``FLIGHT_SECONDS`` of the first touch;
+    0 for the paper's terms alone. A ball on the ground earns those to the end: kicked a little
+    upward or faster it stays there, so nothing leads from it to a ball that flies."""
 
     def __post_init__(self) -> None:
         if self.reach < 0.0:
@@ -126,6 +126,8 @@ def begin(view: View, context: Memory) -> Memory:
     }
     if view.config.reach > 0.0:
         memory["nearest"] = foot_distance(view)
+    if view.config.flight > 0.0:
+        memory["lacks"] = velocity_lacking(ball, torch.zeros_like(ball), context["target"])
     return memory
 
 
@@ -188,15 +190,19 @@ def advance(view: View, memory: Memory) -> Advance:
         "aim": 0.8 * near * closer,
         "line": torch.exp(-0.2 * past.square()) - 1.0,
     }
-    if view.config.flight > 0.0:
-        lacks = velocity_lacking(place, linvel, target)
-        terms["flight"] = view.config.flight * closer / (1.0 + (lacks / FLIGHT).square())
     shaping: Memory = {}
     if view.config.reach > 0.0:
         nearest = torch.minimum(memory["nearest"], foot_distance(view))
         nearest = torch.where(memory["touched"], memory["nearest"], nearest)
         terms["reach"] = view.config.reach * (memory["nearest"] - nearest)
         shaping["nearest"] = nearest
+    if view.config.flight > 0.0:
+        early = since_touch * view.control_timestep <= FLIGHT_SECONDS + 1e-6
+        kicked = touched & early & ~handling & ~squeezed
+        lacks = torch.minimum(memory["lacks"], velocity_lacking(place, linvel, target))
+        lacks = torch.where(kicked, lacks, memory["lacks"])
+        terms["flight"] = view.config.flight * (memory["lacks"] - lacks)
+        shaping["lacks"] = lacks
     return Advance(
         memory={
             "target": target,

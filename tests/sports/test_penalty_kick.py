@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from sports.env import make_env
+from sports.penalty_kick import velocity_lacking
 from tests.sports.pitch import Pitch, seen_from, total
 
 STANDING = 0.9412
@@ -167,6 +169,61 @@ def test_a_wider_aim_is_felt_from_further_away():
         assert step.terms["aim"][0, 0] == pytest.approx(0.8 * paid, abs=1e-6)
     with pytest.raises(ValueError, match="positive"):
         make_env("penalty_kick", num_worlds=1, options={"aim_width": 0.0})
+
+
+@pytest.mark.parametrize("linvel", [(3.7, 0.0, 0.0), (9.0, 1.0, 4.0), (15.0, -2.0, 0.5)])
+def test_what_a_ball_lacks_to_fly_to_its_target(linvel):
+    """The least change of velocity, by scipy over all times of flight; none on the way there."""
+    from scipy.optimize import minimize_scalar
+
+    ball, target = np.array([4.0, 0.0, 0.11]), np.array(TARGET)
+
+    def wanted(time: float) -> np.ndarray:
+        return (target - ball) / time + (0.0, 0.0, 9.81 / 2 * time)
+
+    def lacks(place: np.ndarray, velocity: np.ndarray) -> float:
+        rows = (torch.tensor(x, dtype=torch.float32)[None] for x in (place, velocity, target))
+        return float(velocity_lacking(*rows))
+
+    least = minimize_scalar(
+        lambda time: np.linalg.norm(wanted(time) - linvel), bounds=(0.05, 2.5), method="bounded"
+    )
+    assert lacks(ball, np.array(linvel)) == pytest.approx(least.fun, abs=0.1)
+    assert least.fun <= lacks(ball, np.array(linvel)) + 1e-5
+    fly = wanted(1.1)
+    for t in (0.0, 0.3, 0.7, 1.0):
+        place = ball + fly * t - (0.0, 0.0, 9.81 / 2 * t**2)
+        assert lacks(place, fly - (0.0, 0.0, 9.81 * t)) < 0.06 * np.linalg.norm(fly)
+
+
+def test_a_kick_pays_for_the_velocity_that_it_gives_the_ball_and_once():
+    """From what a ball at rest lacks, sqrt(g (d + z)) for a target d away and z above it, down to
+    nothing; not for a ball that slows, nor later than a fifth of a second after the touch."""
+    target = (16.0, 0.0, 0.11)
+    rest = math.sqrt(9.81 * 12.0)
+    time = 12.0 / 9.0
+    best = (9.0, 0.0, 9.81 / 2 * time)
+    half = tuple(0.5 * v for v in best)
+
+    def pays(pitch: Pitch, linvel, *touching: str) -> float:
+        pitch.ball((4.0, 0.0, 0.11), linvel)
+        return float(pitch.advance(*touching).terms["flight"][0, 0])
+
+    pitch = kicker(target=target, flight=2.0)
+    first = pays(pitch, half, "agent0/R_Toe")
+    assert pays(pitch, (0.0, 0.0, 0.0)) == 0.0
+    assert pays(pitch, half) == 0.0
+    spacing = 0.05 * math.hypot(*best)  # of the times of flight that are compared
+    assert first + pays(pitch, best) == pytest.approx(2.0 * rest, abs=2.0 * spacing)
+    late = kicker(target=target, flight=2.0)
+    pays(late, (0.0, 0.0, 0.0), "agent0/R_Toe")
+    for _ in range(6):
+        assert pays(late, (0.0, 0.0, 0.0)) == 0.0
+    assert pays(late, best) == 0.0
+    by_hand = kicker(target=target, flight=2.0)
+    assert pays(by_hand, best, "agent0/R_Wrist") == 0.0
+    with pytest.raises(ValueError, match="flight"):
+        make_env("penalty_kick", num_worlds=1, options={"flight": -1.0})
 
 
 @pytest.mark.parametrize(("clock", "pays"), [(88, True), (90, False)])
