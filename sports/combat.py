@@ -25,7 +25,7 @@ from torch import Tensor
 
 from sports.physics.base import GRAVITY
 from sports.scene import Start
-from sports.task import Advance, Memory, View, constant, squared
+from sports.task import Advance, Memory, Move, View, constant, place_athlete, squared
 
 TARGETS = ("Pelvis", "Torso", "Spine", "Chest", "Head")
 HALF_DISTANCE = 1.5
@@ -66,6 +66,9 @@ class Options:
     knock_down: float = 0.0
     """Reward for the opponent's fall within 1 s after one's own weapon was in contact with it, and
     cost of such a fall; 0 for the paper's terms alone. A fall without contact earns nothing."""
+    part: bool = False
+    """Who hold each other are parted at once, as by a referee: both are back on guard where the
+    bout began. Without it they may stay so to the end, where nothing that weapons do counts."""
 
     def __post_init__(self) -> None:
         for name in ("point", "knock_down"):
@@ -213,6 +216,11 @@ def advance(
 
     close_steps, holding = clinch(view, memory)
     free = ~holding[:, None]
+    move = None
+    if view.config.part:
+        move = _parted(view, holding)
+        squares = squares.masked_fill(holding[:, None, None, None], math.inf)
+        close_steps = close_steps.masked_fill(holding, 0.0)
 
     wait = memory["wait"]  # steps without contact before the next point
     ready = wait <= 0
@@ -257,11 +265,22 @@ def advance(
             "touches": touches,
             "since_contact": since_contact,
             "close_steps": close_steps,
-            "holding": holding,
+            "holding": torch.zeros_like(holding) if view.config.part else holding,
         },
         terms=terms,
         terminated=ended,
         metrics=metrics,
         success=win,
         outcome=margin.sign(),
+        move=move,
     )
+
+
+def _parted(view: View, mask: Tensor) -> Move:
+    """Both athletes on guard where the bout began, in the worlds of ``mask`` (N,)."""
+    move, zero = None, torch.zeros_like(view.root_pos[:, 0, 0])
+    for agent, start in enumerate(view.physics.scene.agents):
+        place = (zero + start.x, zero + start.y, zero + start.yaw)
+        move = place_athlete(view, mask, agent, *place, onto=move)
+    assert move is not None
+    return move

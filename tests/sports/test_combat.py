@@ -281,6 +281,39 @@ def test_who_holds_earns_nothing_until_both_have_stepped_apart(task):
         assert struck(distance) == (free, free), distance
 
 
+def test_a_referee_parts_who_hold_and_the_bout_goes_on(task):
+    """In the world that held for a second, and there alone; points stay, a blow counts again."""
+    env = make_env(task, num_worlds=2, options={"part": True}, training=False)
+    env.reset()
+    scene, physics = env.physics.scene, env.physics
+    guard = physics.qpos.clone()
+    state = PhysicsState(guard.clone(), torch.full_like(physics.qvel, 0.1), physics.mocap_pos)
+    for agent in range(2):
+        state.qpos[0, scene.agent_qpos(agent).start] = (agent - 0.5) * 0.5
+    physics.reset(torch.ones(2, dtype=torch.bool), state)
+    env.view.refresh()
+    env.memory = env.task.begin(env.view, {}) | {"touches": torch.tensor([[2.0, 1.0]] * 2)}
+    steps = [env.task.advance(env.view, env.memory) for _ in range(1)]
+    for _ in range(29):
+        assert not steps[-1].move.mask.any()
+        env.memory = steps[-1].memory
+        steps.append(env.task.advance(env.view, env.memory))
+    last = steps[-1]
+    assert last.move.mask.tolist() == [True, False]
+    physics.move(last.move.mask, last.move.qpos, last.move.qvel)
+    start = default_state(scene, 2, "cpu").qpos
+    torch.testing.assert_close(physics.qpos[0], start[0])
+    assert torch.equal(physics.qpos[1], state.qpos[1]) and (physics.qvel[0] == 0.0).all()
+    assert torch.equal(physics.qvel[1], state.qvel[1])
+    env.view.refresh()
+    env.memory = last.memory
+    physics.pair_force[:] = 300.0
+    after = env.task.advance(env.view, env.memory)
+    assert not after.move.mask.any() and after.terms["point"][0].abs().max() == 0.0  # out of reach
+    assert after.memory["touches"].tolist() == [[2.0, 1.0]] * 2
+    assert after.memory["close_steps"][0] == 0.0 and not after.memory["holding"].any()
+
+
 def test_each_athlete_has_its_own_half_second(task):
     bout = Bout(task)
     bout.begin()
@@ -349,7 +382,7 @@ def test_more_touches_win_and_as_many_are_a_draw(task):
 
 def test_half_a_turn_with_the_athletes_exchanged_changes_nothing(task):
     """Observations and rewards of states of all kinds, with contacts made up."""
-    env = make_env(task, num_worlds=16, training=False)
+    env = make_env(task, num_worlds=16, options={"part": True}, training=False)
     scene, physics = env.physics.scene, env.physics
     state, everyone = scattered(env, 5), torch.ones(16, dtype=torch.bool)
     state.qpos[3, 2] = 0.2  # has fallen
@@ -368,9 +401,19 @@ def test_half_a_turn_with_the_athletes_exchanged_changes_nothing(task):
         physics.pair_force[:] = (forces.flip(1) if turn else forces).flatten(1)
         physics.link_force[:] = felt.flip(1) * half if turn else felt
         env.view.clock = torch.full((16,), 5)
+        env.memory["close_steps"][:4] = 40.0
         step = env.task.advance(env.view, env.memory)
-        results.append((env._observe(), step.terms, step.terminated))
-    (obs, terms, terminated), (other_obs, other_terms, other_terminated) = results
+        assert step.move is not None and step.move.mask.any()
+        moved = (step.move.qpos, step.move.qvel)
+        results.append((env._observe(), step.terms, step.terminated, moved))
+    (obs, terms, terminated, moved), (other_obs, other_terms, other_terminated, other) = results
+    other = swapped(*other, scene)
+    for agent in range(2):  # a rotation has two quaternions
+        at = scene.agent_qpos(agent).start + 3
+        quats, turned = moved[0][:, at : at + 4], other[0][:, at : at + 4]
+        turned *= (quats * turned).sum(-1, keepdim=True).sign()
+    for mine, others in zip(moved, other):
+        torch.testing.assert_close(mine, others, atol=1e-5, rtol=1e-5)
     assert (obs - other_obs.flip(1)).abs().max() < 1e-5
     for name, term in terms.items():
         assert (term - other_terms[name].flip(1)).abs().max() < 1e-5, name
