@@ -18,6 +18,8 @@ from warmstart import atomic
 BEGIN, END = "<!-- results -->", "<!-- /results -->"
 REQUIRED = ("task", "algo", "engine", "strength", "trials", "seed", "commit", "metrics")
 PAPER_COLUMNS = ("PPO", "AMP", "PULSE", "PULSE + AMP")
+PAPER_METHOD = {"amp": "AMP", "latent": "PULSE", "latent-amp": "PULSE + AMP"}
+"""The paper's method beside which an algorithm of ours stands; PPO for the others."""
 
 
 def read_results(folder: str | Path) -> list[dict[str, Any]]:
@@ -112,6 +114,7 @@ def summary_table(results: Sequence[Mapping[str, Any]]) -> str:
     for r in results:
         known = paper.get(r["task"], {})
         ours = [m for m in r["metrics"] if m in known] or list(r["metrics"])[:2]
+        beside = PAPER_METHOD.get(r["algo"], "PPO")
         rows.append(
             [
                 r["task"],
@@ -121,11 +124,20 @@ def summary_table(results: Sequence[Mapping[str, Any]]) -> str:
                 str(r["trials"]),
                 "; ".join(f"{m} {_ours(r['metrics'][m])}" for m in ours),
                 "; ".join(
-                    f"{m} {_value(known[m]['PPO'], known[m]['unit'])}" for m in ours if m in known
-                ),
+                    f"{m} {_value(known[m][beside], known[m]['unit'])}" for m in ours if m in known
+                )
+                + (f" ({beside})" if beside != "PPO" else ""),
             ]
         )
-    head = ["task", "algorithm", "strength", "engine", "trials", "result", "paper (PPO)"]
+    head = [
+        "task",
+        "algorithm",
+        "strength",
+        "engine",
+        "trials",
+        "result",
+        "paper (PPO, or as said)",
+    ]
     return "\n".join(_markdown(head, rows)) if rows else "No results yet."
 
 

@@ -63,6 +63,14 @@ def test_the_front_page_keeps_its_text(folder: Path):
     assert front.read_text() == once
 
 
+@pytest.mark.parametrize(
+    ("algo", "height"), [("ppo", "4.08"), ("selfplay", "4.08"), ("latent", "2.01 m (PULSE)")]
+)
+def test_a_method_stands_beside_the_papers_own(algo: str, height: str):
+    row = leaderboard.summary_table([result(algo=algo)]).splitlines()[2]
+    assert f"height_1.0m {height}" in row.split("|")[-2]
+
+
 def test_a_front_page_without_marks_changes_nothing(folder: Path):
     front = folder / "front.md"
     front.write_text("# Title\n")
