@@ -93,6 +93,11 @@ class Hurdling:
     toppling: bool = False
     """Hurdles are free bodies that fall when hit. Their height is then that of the race or
     ``height`` in training too: a hurdle that stands on the ground cannot be sunk into it."""
+    lower: float = 0.0
+    """Metres by which a world's heights fall with an episode that ended before the finish and
+    raised nothing; 0 for heights that only rise. One lucky hurdle raises them for good: at h_max
+    0.7 m a policy was seen that runs over nine hurdles of 0.3 m and one of 0.5 m. With 0.02 they
+    stay where one episode in eight or nine raises them."""
     finish_ends: bool = False
     """End the episode at the finish. Nothing is paid beyond it: training is spared idle steps. The
     paper's distance needs the whole 600."""
@@ -101,6 +106,8 @@ class Hurdling:
         low, high, kind = 0.0, HIGHEST, "hurdle"
         if self.toppling:
             low, high, kind = LOWEST_TOPPLING, HIGHEST_TOPPLING, "toppling hurdle"
+        if self.lower < 0.0:
+            raise ValueError(f"heights fall by 0 m or more, not {self.lower}")
         if self.height is not None and not low <= self.height <= high:
             raise ValueError(f"a {kind} must be {low} to {high} m high, not {self.height}")
 
@@ -164,8 +171,13 @@ def scene(config: Hurdling, body: Body) -> Scene:
 
 def curriculum(config: Hurdling, num_worlds: int, device: torch.device) -> Memory:
     """Each world's ``h_max`` (m): its hurdles are drawn between the ground and that."""
-    grows = config.curriculum and config.height is None and not config.toppling
-    return {"h_max": torch.full((num_worlds,), LEAST_MAX if grows else MOST_MAX, device=device)}
+    low = LEAST_MAX if curriculum_grows(config) else MOST_MAX
+    return {"h_max": torch.full((num_worlds,), low, device=device)}
+
+
+def curriculum_grows(config: Hurdling) -> bool:
+    """Whether heights follow what the athlete clears."""
+    return config.curriculum and config.height is None and not config.toppling
 
 
 def promote(view: View, memory: Memory, step: Advance, ended: Tensor) -> Memory:
@@ -174,8 +186,13 @@ def promote(view: View, memory: Memory, step: Advance, ended: Tensor) -> Memory:
     the finish as well, which three in four do not reach, heights rose from 0.3 to 0.6 m in 43 M
     samples of PPO."""
     h_max = view.curriculum["h_max"]
-    up = ended & (memory["highest"] >= PROOF * h_max) & memory["standing"]
-    return {"h_max": (h_max + RAISE * up).clamp(max=MOST_MAX)}
+    own = ended & memory["standing"]
+    up = own & (memory["highest"] >= PROOF * h_max)
+    h_max = h_max + RAISE * up
+    if view.config.lower > 0.0 and curriculum_grows(view.config):
+        down = own & ~up & ~memory["finished"]
+        h_max = (h_max - view.config.lower * down).clamp(min=LEAST_MAX)
+    return {"h_max": h_max.clamp(max=MOST_MAX)}
 
 
 def start(

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sports.env import make_env, make_scene
-from sports.hurdling import MOST_MAX, least_time, toppling_shapes
+from sports.hurdling import MOST_MAX, Hurdling, least_time, toppling_shapes
 from sports.physics import PhysicsState, default_state, make_physics
 from sports.registry import get_task, make_config
 from tests.sports.hand_made import HandMade
@@ -249,6 +249,26 @@ def test_a_high_hurdle_that_was_cleared_raises_the_next_ones():
     torch.testing.assert_close(raised, expected)
     kept = env.task.promote(env.view, env.memory, step, ~everyone)["h_max"]
     assert torch.equal(kept, env.view.curriculum["h_max"])
+
+
+def test_heights_fall_with_a_race_that_ends_early_where_they_may():
+    world = HandMade("hurdling", num_worlds=6, lower=0.02)
+    world.place((50.0, 0.0, STANDING))
+    world.begin()
+    env = world.env
+    h_max = torch.tensor([0.5, 0.5, 0.5, 0.5, 0.31, 0.5])
+    env.view.curriculum = {"h_max": h_max}
+    step = world.advance()
+    env.memory["highest"] = torch.tensor([0.3, 0.41, 0.3, 0.3, 0.0, 0.3])
+    env.memory["finished"] = torch.tensor([False, False, True, False, False, False])
+    env.memory["standing"] = torch.tensor([True, True, True, False, True, True])
+    ended = torch.tensor([True, True, True, True, True, False])
+    assert env.task.promote is not None
+    now = env.task.promote(env.view, env.memory, step, ended)["h_max"]
+    # Fell; raised; finished; a demonstration; down to the least; goes on.
+    torch.testing.assert_close(now, torch.tensor([0.48, 0.65, 0.5, 0.5, 0.3, 0.5]))
+    with pytest.raises(ValueError, match="0 m or more"):
+        Hurdling(lower=-0.1)
 
 
 def test_a_hurdle_is_cleared_when_the_next_one_is_reached():
