@@ -212,7 +212,7 @@ def start(
     if training and config.curriculum:
         race = draw[:, 1] < RACES
         first = (HURDLES * draw[:, 0]).floor().masked_fill(race, 0.0)
-        if config.height is None and not config.toppling:
+        if curriculum_grows(config):
             grown = draw[:, 2:] * view.curriculum["h_max"][:, None]
             heights = torch.where(race[:, None], heights, grown)
     standing = torch.ones(n, dtype=torch.bool, device=device)
