@@ -33,7 +33,7 @@ from sports import quaternion
 from sports.humanoid.body import Body, Shape
 from sports.physics.base import GRAVITY, PhysicsState
 from sports.scene import Scene, SceneObject
-from sports.task import Advance, Memory, Task, View, clamp01, constant, length, nan_where
+from sports.task import Advance, Memory, Task, View, constant, length, nan_where
 
 HURDLES = 10
 FIRST_X, GAP = 13.72, 9.14
@@ -98,6 +98,11 @@ class Hurdling:
     raised nothing; 0 for heights that only rise. One lucky hurdle raises them for good: at h_max
     0.7 m a policy was seen that runs over nine hurdles of 0.3 m and one of 0.5 m. With 0.02 they
     stay where one episode in eight or nine raises them."""
+    landing: float = 0.0
+    """Metres behind a hurdle in which progress is paid only at their end; 0 pays every metre, as
+    the paper does. Who trips over a hurdle gains two metres as well: whom no hurdle of that height
+    lets pass otherwise learns to dive, 18 m far into the race (PPO in latents, 230 M samples). With
+    2.5 a fall there pays nothing, and a landing on the feet all of it."""
     finish_ends: bool = False
     """End the episode at the finish. Nothing is paid beyond it: training is spared idle steps. The
     paper's distance needs the whole 600."""
@@ -108,6 +113,8 @@ class Hurdling:
             low, high, kind = LOWEST_TOPPLING, HIGHEST_TOPPLING, "toppling hurdle"
         if self.lower < 0.0:
             raise ValueError(f"heights fall by 0 m or more, not {self.lower}")
+        if not 0.0 <= self.landing < GAP:
+            raise ValueError(f"a landing takes 0 m to less than {GAP} m, not {self.landing}")
         if self.height is not None and not low <= self.height <= high:
             raise ValueError(f"a {kind} must be {low} to {high} m high, not {self.height}")
 
@@ -244,11 +251,12 @@ def begin(view: View, context: Memory) -> Memory:
     root = links[:, 0]
     behind = hurdles_behind(links[..., 0])
     zero = torch.zeros_like(root[:, 0])
+    left = length(root - constant(GOAL, root.device)) + withheld(root[:, 0], view.config.landing)
     return {
         "marks": context["marks"],
         "standing": context["standing"],
         "whole": context["standing"] & (context["first"] == 0.0),
-        "left": length(root - constant(GOAL, root.device)),
+        "left": left,
         "links": links.clone(),
         "behind": behind,
         "start_x": root[:, 0].clone(),
@@ -276,8 +284,8 @@ def advance(view: View, memory: Memory) -> Advance:
     """One control step by the rules of the sport."""
     root = view.root_pos[:, 0]
     x, y, _ = root.unbind(-1)
-    left = length(root - constant(GOAL, root.device))
-    terms = {"progress": clamp01(memory["left"] - left)}
+    left = length(root - constant(GOAL, root.device)) + withheld(x, view.config.landing)
+    terms = {"progress": (memory["left"] - left).clamp(0.0, 1.0 + view.config.landing)}
 
     heights, knocked = memory["marks"][:, :HURDLES, 2], torch.zeros_like(x)
     if view.config.toppling:
@@ -347,6 +355,14 @@ def advance(view: View, memory: Memory) -> Advance:
 def hurdles_behind(x: Tensor) -> Tensor:
     """How many of the hurdles' planes lie at or behind x (m), 0 to 10, as a float."""
     return ((x + (GAP - FIRST_X)) / GAP).floor_().clamp_(0.0, HURDLES)
+
+
+def withheld(x: Tensor, landing: float) -> Tensor:
+    """(N,) metres at x (m) that are not yet paid for: those since the last hurdle, up to
+    ``landing``, at whose end none are."""
+    behind = hurdles_behind(x)
+    since = x - (FIRST_X + GAP * (behind - 1.0))
+    return since.masked_fill((behind < 1.0) | (since >= landing), 0.0)
 
 
 def least_time(distance: Tensor, top_speed: Tensor) -> Tensor:

@@ -42,6 +42,26 @@ def test_hurdles_and_finish_are_seen_from_the_athlete():
     torch.testing.assert_close(seen["finish"].view(3), right, atol=1e-3, rtol=0)
 
 
+def test_a_landing_pays_the_metres_over_the_hurdle():
+    places = [4.0, 6.0, 13.0, 13.7, 14.2, 15.2, 16.1, 16.3, 17.0]  # the hurdle is at 13.72
+    world = at(places[0], landing=2.5)
+    goal = (110.0, 0.0, 1.0)
+    far = [math.dist((x, 0.0, STANDING), goal) for x in places]
+    paid = []
+    for x in places[1:]:
+        world.place((x, 0.0, HIGH if 13.0 < x < 15.0 else STANDING))
+        paid.append(float(world.advance().terms["progress"][0, 0]))
+    # Before the hurdle as ever (clamped to what a step and a landing can be), then nothing until
+    # 16.22 m, where all of it comes at once.
+    assert paid[0] == pytest.approx(far[0] - far[1], abs=1e-4)
+    assert paid[2] == pytest.approx(0.7, abs=0.02)
+    assert paid[3:6] == pytest.approx([0.0] * 3, abs=0.02)
+    assert paid[6] == pytest.approx(16.3 - 13.7, abs=0.02)
+    assert paid[7] == pytest.approx(0.7, abs=1e-3)
+    with pytest.raises(ValueError, match="landing"):
+        Hurdling(landing=9.2)
+
+
 def test_progress_is_paid_once():
     world = at(10.0)
     goal = (110.0, 0.0, 1.0)
