@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sports.env import make_env, make_scene
-from sports.hurdling import MOST_MAX, Hurdling, least_time, toppling_shapes
+from sports.hurdling import MOST_MAX, RACE_HEIGHT, Hurdling, least_time, toppling_shapes
 from sports.physics import PhysicsState, default_state, make_physics
 from sports.registry import get_task, make_config
 from tests.sports.hand_made import HandMade
@@ -289,6 +289,22 @@ def test_heights_fall_with_a_race_that_ends_early_where_they_may():
     torch.testing.assert_close(now, torch.tensor([0.48, 0.65, 0.5, 0.5, 0.3, 0.5]))
     with pytest.raises(ValueError, match="0 m or more"):
         Hurdling(lower=-0.1)
+
+
+def test_no_hurdle_is_lower_than_the_least_share_of_h_max():
+    world = HandMade("hurdling", num_worlds=400, least=0.8)
+    env = world.env
+    env.view.curriculum = {"h_max": torch.full((400,), 0.5)}
+    for training, low, high in ((True, 0.4, 0.5), (False, 1.067, 1.067)):
+        state = default_state(env.physics.scene, 400, env.device)
+        generator = torch.Generator().manual_seed(0)
+        _, context = env.task.start(env.view, state, {}, generator, training)
+        tops = context["marks"][:, :10, 2]
+        drawn = tops[(tops > 0.0) & (tops < RACE_HEIGHT - 0.01)] if training else tops
+        assert float(drawn.min()) == pytest.approx(low, abs=2e-3)
+        assert float(drawn.max()) == pytest.approx(high, abs=2e-3)
+    with pytest.raises(ValueError, match="least share"):
+        Hurdling(least=1.0)
 
 
 def test_a_hurdle_is_cleared_when_the_next_one_is_reached():
