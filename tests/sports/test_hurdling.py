@@ -62,6 +62,31 @@ def test_a_landing_pays_the_metres_over_the_hurdle():
         Hurdling(landing=9.2)
 
 
+def test_a_leap_before_a_hurdle_is_paid_once_and_as_far_as_it_is_needed():
+    def leaps(states: list[tuple[float, float, float]], height: float) -> list[float]:
+        """What is paid at x, with the root z high, rising at a speed."""
+        world = at(10.0, leap=10.0, height=height)
+        paid = []
+        for x, z, speed in states:
+            world.place((x, 0.0, z))
+            world.state.qvel[:, 2] = speed
+            paid.append(round(float(world.advance().terms["leap"][0, 0]), 3))
+        return paid
+
+    fast = math.sqrt(2 * 9.81 * 0.2)  # rises by 0.2 m
+    states = [(11.0, 0.95, fast), (11.5, 0.95, fast), (12.0, 1.0, fast), (12.5, 1.0, 0.0)]
+    # Too far away; 0.2 m; 0.05 m more; nothing for less.
+    assert leaps(states, 0.9) == pytest.approx([0.0, 2.0, 0.5, 0.0], abs=2e-3)
+    # A hurdle of 0.6 m asks for 0.1 m, one of half a metre for nothing.
+    assert leaps(states, 0.6) == pytest.approx([0.0, 1.0, 0.0, 0.0], abs=2e-3)
+    assert leaps(states, 0.5) == [0.0] * 4
+    # Falling is no leap; behind the hurdle nothing is paid, before the next one again.
+    more = [(12.0, 0.95, -fast), (12.5, 0.95, fast), (14.0, 1.3, fast), (21.0, 0.95, fast)]
+    assert leaps(more, 0.9) == pytest.approx([0.0, 2.0, 0.0, 2.0], abs=2e-3)
+    with pytest.raises(ValueError, match="leaping"):
+        Hurdling(leap=-1.0)
+
+
 def test_progress_is_paid_once():
     world = at(10.0)
     goal = (110.0, 0.0, 1.0)
