@@ -64,8 +64,9 @@ observations lay at their bounds, and it fell over at the start."""
 PROOF = 0.8
 """Share of h_max that the highest hurdle cleared must have had to count."""
 
-TAKE_OFF = 2.5
-"""A leap over a hurdle begins at most so far before it (m)."""
+TAKE_OFF = (0.7, 2.5)
+"""Metres before a hurdle in which a leap over it begins. Nearer, a thigh that hits the board is
+thrown up by it, and a policy was seen that lived on that."""
 CLEARANCE, LOW_ROOT = 0.45, 0.95
 """Height of the root over a hurdle's top that is enough to clear it with the legs tucked in, and
 the height that running has without a leap (m)."""
@@ -115,8 +116,7 @@ class Hurdling:
     lets pass otherwise learns to dive, 18 m far into the race (PPO in latents, 230 M samples). With
     2.5 a fall there pays nothing, and a landing on the feet all of it."""
     leap: float = 0.0
-    """Reward for each metre by which the athlete, within ``TAKE_OFF`` m before a hurdle, has come
-    nearer to rising ``CLEARANCE`` above it with its root than ever before in the episode; 0 for
+    """Reward for each metre by which the athlete, ``TAKE_OFF`` m before a hurdle, has come nearer to rising ``CLEARANCE`` above it with its root than ever before in the episode; 0 for
     none. A runner steps over hurdles of half a metre by lifting its knees a little more; one who
     does that at 0.6 m trips all the same, and nothing tells it to leap."""
     finish_ends: bool = False
@@ -391,7 +391,7 @@ def hurdles_behind(x: Tensor) -> Tensor:
 
 def leap(view: View, memory: Memory) -> Tensor:
     """(N,) metres above ``LOW_ROOT`` to which the root will rise in free flight, as far as the
-    hurdle that comes next within ``TAKE_OFF`` asks for it; 0 elsewhere."""
+    hurdle that comes next asks for it, ``TAKE_OFF`` before it; 0 elsewhere."""
     root, up = view.root_pos[:, 0], view.root_linvel[:, 0, 2].clamp(min=0.0)
     behind = hurdles_behind(root[:, 0])
     number = behind.clamp(max=HURDLES - 1.0)
@@ -400,7 +400,7 @@ def leap(view: View, memory: Memory) -> Tensor:
     apex = root[:, 2] + up.square() / (2.0 * GRAVITY)
     wanted = (tops + CLEARANCE - LOW_ROOT).clamp(min=0.0)
     rises = torch.minimum((apex - LOW_ROOT).clamp(min=0.0), wanted)
-    return rises.masked_fill((ahead < 0.0) | (ahead > TAKE_OFF), 0.0)
+    return rises.masked_fill((ahead < TAKE_OFF[0]) | (ahead > TAKE_OFF[1]), 0.0)
 
 
 def withheld(x: Tensor, landing: float) -> Tensor:

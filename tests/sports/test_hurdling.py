@@ -80,6 +80,8 @@ def test_a_leap_before_a_hurdle_is_paid_once_and_as_far_as_it_is_needed():
     # A hurdle of 0.6 m asks for 0.1 m, one of half a metre for nothing.
     assert leaps(states, 0.6) == pytest.approx([0.0, 1.0, 0.0, 0.0], abs=2e-3)
     assert leaps(states, 0.5) == [0.0] * 4
+    # Right before the board nothing is paid: there a trip throws the athlete up.
+    assert leaps([(13.1, 0.95, fast)], 0.9) == [0.0]
     # Falling is no leap; behind the hurdle nothing is paid, before the next one again.
     more = [(12.0, 0.95, -fast), (12.5, 0.95, fast), (14.0, 1.3, fast), (21.0, 0.95, fast)]
     assert leaps(more, 0.9) == pytest.approx([0.0, 2.0, 0.0, 2.0], abs=2e-3)
