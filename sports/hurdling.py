@@ -117,8 +117,9 @@ class Hurdling:
     2.5 a fall there pays nothing, and a landing on the feet all of it."""
     leap: float = 0.0
     """Reward for each metre by which the athlete, ``TAKE_OFF`` m before a hurdle, has come nearer
-    to rising ``CLEARANCE`` above it with its root than ever before at this one; 0 for none. A runner steps over hurdles of half a metre by lifting its knees a little more; one who
-    does that at 0.6 m trips all the same, and nothing tells it to leap."""
+    to rising ``CLEARANCE`` above it with its root than ever before at this one; 0 for none. A
+    runner steps over hurdles of half a metre by lifting its knees a little more; one who does that
+    at 0.6 m trips all the same, and nothing tells it to leap."""
     finish_ends: bool = False
     """End the episode at the finish. Nothing is paid beyond it: training is spared idle steps. The
     paper's distance needs the whole 600."""
