@@ -75,7 +75,7 @@ def load_reference(clips: Sequence[Path]) -> Reference:
 def _sources(config: Likeness) -> list[tuple[str, str, str]]:
     """(label, source, task) of each panel; the task is empty for a file of motions."""
     from rl.pretrained import available
-    from sports.registry import get_task
+    from sports.registry import get_task, task_names
 
     for task in config.task:
         get_task(task)
@@ -90,7 +90,7 @@ def _sources(config: Likeness) -> list[tuple[str, str, str]]:
                     p["task"],
                 )
                 for p in available()
-                if (not config.task or p["task"] in config.task)
+                if p["task"] in (config.task or task_names())  # the tracker plays no sport
                 and kind in ("", p["algo"], f"{p['algo']}-{p['strength']}")
             ]
             if not shipped:
