@@ -208,7 +208,6 @@ def test_the_gate_decides_what_is_certified(fake, tmp_path):
 
 def test_ray_gives_the_same_files_as_processes(fake, tmp_path):
     """On a Ray that is started here; a worker that dies takes nothing else with it."""
-    pytest.importorskip("ray")
     values = [3.0, 1.8, 2.2, 1.0]
     one = run(fake, tmp_path / "processes", values, {"fussy": True})
     two = run(fake, tmp_path / "ray", values, {"fussy": True}, cluster="local")
