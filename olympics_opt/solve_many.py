@@ -144,15 +144,16 @@ def table(results: list[Result], problems: dict[str, Any]) -> Any:
 
     out = plain_table(
         *("problem", "solve\n(s)", "iterations", "violation", "asked", "achieved\nin MuJoCo"),
-        *("achieved\nin Drake", "tracked\nin MuJoCo", "Drake\n+ SNOPT", "verdict"),
+        *("achieved\nin Drake", "tracked\nin MuJoCo", "feedback\nin Drake"),
+        *("Drake\n+ SNOPT", "verdict"),
         caption="achieved: the torques replayed open loop (a kick after a step: with feedback); "
-        "tracked: with feedback",
+        "tracked: by a search in the simulation; feedback: the torques corrected linearly",
     )
     for r in results:
         unit = problems[r.problem].unit
         achieved = [
             f"{number(r.achieved[name])} {unit}" if name in r.achieved else "–"
-            for name in ("replay_mujoco", "replay_drake", "tracked")
+            for name in ("replay_mujoco", "replay_drake", "tracked", "feedback_drake")
         ]
         agrees = r.opinion.get("agrees")
         out.add_row(

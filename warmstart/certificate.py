@@ -21,7 +21,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +154,8 @@ class Certificate:
     achieved: dict[str, float]
     """``planned``, ``replay_mujoco``, ``replay_drake``: the outcome (m; m/s of a strike or
     throw); 0 for a replay that made no valid attempt (open loop, a jump may fall), missing if it
-    could not be computed."""
+    could not be computed. Of jumps also ``feedback_mujoco``, ``feedback_drake``: with the feedback
+    of :mod:`warmstart.feedback`."""
     checks: tuple[Check, ...]
     stats: dict[str, Any]
 
@@ -261,6 +262,8 @@ def certify(solution: Solution) -> Certificate:
         ("touch-down", lambda: _touch_down(solution)),
         ("replay in mujoco", lambda: _replay(solution, "mujoco", achieved)),
         ("replay in drake", lambda: _replay(solution, "drake", achieved)),
+        ("feedback in mujoco", lambda: _feedback(solution, "mujoco", achieved)),
+        ("feedback in drake", lambda: _feedback(solution, "drake", achieved)),
     ]
     broken = []
     for name, compute in groups:
@@ -481,6 +484,15 @@ def _replay(solution: Solution, engine: str, achieved: dict[str, float]) -> dict
     achieved[f"replay_{engine}"] = outcome
     found = {f"replay in {engine}: outcome": outcome}
     return found | _root_error(solution, engine, times, qpos)
+
+
+def _feedback(solution: Solution, engine: str, achieved: dict[str, float]) -> dict[str, float]:
+    """The outcome of a jump whose torques are corrected by feedback: recorded, no check."""
+    if solution.problem in OUTCOMES and not solution.stats.get(FEEDBACK):
+        closed = replace(solution, stats=solution.stats | {FEEDBACK: True})
+        outcome = OUTCOMES[solution.problem].measure(solution.body, *replay(closed, engine))
+        achieved[f"feedback_{engine}"] = outcome if math.isfinite(outcome) else 0.0
+    return {}
 
 
 def _root_error(

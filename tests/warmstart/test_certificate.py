@@ -128,6 +128,10 @@ def test_the_achieved_height_is_that_of_the_soles_over_the_bar(good):
     for height in good.achieved.values():
         assert soles.min() - 0.06 < height < soles.max() + 0.002
     assert good.achieved["planned"] == pytest.approx(good.achieved["replay_drake"], abs=0.02)
+    for engine in ("mujoco", "drake"):  # linear feedback holds the plan closer still
+        assert good.achieved[f"feedback_{engine}"] == pytest.approx(
+            good.achieved["planned"], abs=0.01
+        )
 
 
 def test_at_rest_the_ground_carries_the_weight_in_both_engines():
