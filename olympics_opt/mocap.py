@@ -79,7 +79,10 @@ class Pack:
 
 
 def main(args: Sequence[str]) -> int:
-    """``olympics-opt mocap ...``: 0 done, 1 when some files could not be read."""
+    """``olympics-opt mocap ...``: 0 done, 1 when some files could not be read.
+
+    When none could, ValueError is raised, which the command line ends with exit code 2.
+    """
     import tyro
 
     words = list(args)

@@ -5,13 +5,16 @@ Rotations go through scipy, kinematics through MuJoCo.
 
 from __future__ import annotations
 
+import csv
 import io
 import json
+from pathlib import Path
 
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sports.humanoid import body as body_module
 from sports.humanoid.body import Body, load_body
 from sports.humanoid.mjcf import body_name, build_model
 from warmstart.mocap.skeleton import JointMap
@@ -90,6 +93,21 @@ def smpl_pose(qpos: np.ndarray, z_up: bool) -> tuple[np.ndarray, np.ndarray]:
         parts.append(turn.as_rotvec())
     place = qpos[:, :3] if z_up else qpos[:, :3] @ AXES
     return np.concatenate(parts, axis=1), place
+
+
+def smpl_chain(poses: np.ndarray, trans: np.ndarray) -> dict[str, np.ndarray]:
+    """Link -> (T, 3) joint of poses (T, 72) along SMPL's chain from ``trans`` (m), by the offsets
+    of the body table; the world's axes are the file's."""
+    table = Path(body_module.__file__).parent / "data" / "body_smpl.csv"
+    turn, place = {}, {}
+    for row in csv.DictReader(table.open()):
+        name, parent = row["body"], row["parent"]
+        j = SMPL_ORDER.index(name)
+        own = Rotation.from_rotvec(poses[:, 3 * j : 3 * j + 3])
+        off = np.array([float(row[f"offset_{a}"]) for a in "xyz"]) @ AXES  # to y up
+        turn[name] = turn[parent] * own if parent else own
+        place[name] = place[parent] + turn[parent].apply(off) if parent else trans
+    return place
 
 
 def amass(qpos: np.ndarray, width: int = 72, fps: float = 30.0) -> bytes:

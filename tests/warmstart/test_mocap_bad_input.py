@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import re
 import tarfile
 import zipfile
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from hypothesis import strategies as st
 from olympics_opt import cli
 from tests.warmstart import mocap_files as files
 from warmstart.mocap.bvh import read_bvh
+from warmstart.mocap.capture import Capture
 from warmstart.mocap.importer import Options, import_motions
 from warmstart.mocap.readers import read_capture
 from warmstart.mocap.source import Recording, recordings
@@ -196,6 +199,98 @@ def test_wrong_units_are_told(unit: float):
         read_bvh(files.bvh(QPOS), (files.own_map("bvh", unit),))
 
 
+LENGTHS = {
+    "amass.npz": ("trans",),
+    "wham.npz": ("trans_world",),
+    "gvhmr.npz": ("transl",),
+    "tram.npz": ("pred_trans", "world_cam_T"),
+}
+"""Entries in metres of each layout of SMPL parameters."""
+
+
+def in_unit(name: str, metres: float) -> bytes:
+    """A good file whose lengths are in units of so many metres."""
+    with np.load(io.BytesIO(GOOD[name])) as old:
+        return changed(name, **{key: old[key] / metres for key in LENGTHS[name]})
+
+
+@pytest.mark.parametrize("metres", [0.01, 0.001, 0.0254])
+@pytest.mark.parametrize("name", LENGTHS)
+def test_a_translation_in_another_unit_is_told(name: str, metres: float):
+    assert "the unit of length is wrong" in sentence(name, in_unit(name, metres))
+
+
+def test_a_root_in_another_unit_is_told_in_every_format():
+    value = json.loads(GOOD["a.txt"])
+    for row in value["Frames"]:
+        row[1:4] = [100 * x for x in row[1:4]]
+    assert "unit of length is wrong" in sentence("a.txt", json.dumps(value).encode())
+    text = files.bvh(np.concatenate([QPOS[:, :2] * 50, QPOS[:, 2:] * 1.0], axis=1))
+    assert "unit of length is wrong" in sentence("a.bvh", text.encode())
+
+
+FPS = 60.0
+TIME = np.arange(241) / FPS
+STEP = files.motion(241)
+"""Four seconds: every hinge swings a little, the pelvis goes 1.1 m."""
+
+
+def placed(x: np.ndarray | float, z: np.ndarray | float, pose: np.ndarray = STEP) -> Capture:
+    """The motion with the pelvis at (x, 0, z) m."""
+    qpos = pose.copy()
+    qpos[:, 0], qpos[:, 1], qpos[:, 2] = x, 0.0, z
+    return read_capture(Recording("", "a.npz", files.amass(qpos, fps=FPS)))
+
+
+def jitter(size: float) -> np.ndarray:
+    return size * np.random.default_rng(0).normal(size=len(TIME))
+
+
+PLAUSIBLE = {
+    "sprint": (13.0 * TIME, 1.0 + 0.05 * np.sin(25 * TIME)),
+    "sprint from the blocks": (np.minimum(5.0 * TIME**2, 13.0 * TIME), 1.0),
+    "fall of a second": (0.0, 6.0 - 4.9 * np.minimum(TIME, 1.0) ** 2),
+    "trampoline": (0.0, 1.0 + 4.9 * (TIME % 1.8) * (1.8 - TIME % 1.8)),
+    "stairs": (0.6 * TIME, 1.0 + 0.4 * TIME),
+    "floor 9 m down": (TIME, 10.0),
+    "floor 9 m up": (TIME, -8.0),
+    "a hall of 100 m": (100.0, 1.0),
+    "two jumps of the recording": (25.0 * (TIME > 1) + 25.0 * (TIME > 3), 1.0),
+    "a noisy video": (TIME + jitter(0.05), 1.0 + jitter(0.05)),
+    "lying still": (jitter(1e-4), 0.1),
+}
+
+
+@pytest.mark.parametrize("kind", PLAUSIBLE)
+def test_what_people_do_is_in_metres(kind: str):
+    assert placed(*PLAUSIBLE[kind]).num_frames == len(TIME)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002, 0.02])
+def test_a_still_skier_is_in_metres(noise: float):
+    """The feet slide at 15 m/s and the legs hardly move."""
+    still = np.repeat(STEP[:1], len(TIME), axis=0)
+    still[:, 7:] += noise * np.sin(np.outer(TIME, np.linspace(2, 9, still.shape[1] - 7)))
+    assert placed(15.0 * TIME, 1.0, still).num_frames == len(TIME)
+
+
+@pytest.mark.parametrize("unit", [100, 1000])
+def test_small_steps_in_another_unit_are_told_by_the_feet(unit: float):
+    """A slow knee bend about the origin: too slow for the bounds of the pelvis alone."""
+    bend = 0.5 + 0.3 * np.sin(0.5 * TIME)
+    qpos = np.repeat(STEP[:1], len(TIME), axis=0)
+    qpos[:, 3:7] = [1.0, 0.0, 0.0, 0.0]
+    qpos[:, 7:] = 0.0
+    for side in "LR":
+        for joint, sign in (("Hip", -1.0), ("Knee", 2.0), ("Ankle", -1.0)):
+            qpos[:, 7 + files.BODY.dof_index(f"{side}_{joint}_y")] = sign * bend
+    where = files.positions(qpos)
+    height = where["Pelvis"][:, 2] - where["L_Ankle"][:, 2]
+    assert placed(0.0, height, qpos).num_frames == len(TIME)
+    with pytest.raises(ValueError, match="feet slide" if unit == 100 else "unit of length"):
+        placed(0.0, unit * (height - height.mean()), qpos)
+
+
 def test_an_unknown_skeleton_lists_the_known_ones():
     text = files.bvh(QPOS).replace("L_Knee", "knie_links")
     with pytest.raises(ValueError, match=r"unknown skeleton .* bandai_namco.*--joint-map"):
@@ -217,15 +312,21 @@ def test_a_pickle_is_refused_and_never_run(tmp_path: Path):
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_zip_bomb_is_refused_before_it_unpacks():
+def bomb() -> bytes:
+    """A small npz that unpacks to 300 MiB."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         with archive.open("poses.npy", "w", force_zip64=True) as member:
             for _ in range(300):
                 member.write(bytes(2**20))
         archive.writestr("trans.npy", b"")
-    assert len(buffer.getvalue()) < 2**20
-    assert "300 MiB" in sentence("amass.npz", buffer.getvalue())
+    return buffer.getvalue()
+
+
+def test_a_zip_bomb_is_refused_before_it_unpacks():
+    raw = bomb()
+    assert len(raw) < 2**20
+    assert "300 MiB" in sentence("amass.npz", raw)
 
 
 def test_a_forged_shape_is_refused():
@@ -340,18 +441,102 @@ def sources(folder: Path) -> dict[str, Path]:
     return out
 
 
+def bad_files() -> dict[str, tuple[str, bytes, str]]:
+    """Motion files that cannot be read, by what is wrong: name, content, word of the sentence."""
+    pose = np.zeros((6, 72))
+    pose[4, 10] = np.nan
+    rows = json.loads(GOOD["a.txt"])["Frames"]
+    gap = [list(row) for row in rows]
+    gap[2][5] = float("nan")
+    zeros = {k: {"poses": np.zeros((k, 72)), "trans": np.zeros((k, 3))} for k in (0, 1)}
+    bvh = GOOD["a.bvh"].decode()
+    time = next(line for line in bvh.splitlines() if line.startswith("Frame Time"))
+    head = bvh.rstrip().rpartition(" ")[0]
+    empty = ":FULLY-SPECIFIED\n:DEGREES\n"
+    inner = files.npz(poses=np.array([{}], dtype=object), trans=np.zeros((1, 3)))
+    out = {
+        "cut npz": ("a.npz", GOOD["amass.npz"][:-300], "damaged"),
+        "nan": ("a.npz", changed("amass.npz", poses=pose), "frame 4"),
+        "nan in json": ("a.json", json.dumps({"Frames": gap}).encode(), "frame 2"),
+        "nan in bvh": ("a.bvh", f"{head} nan\n", "'nan' is not a number"),
+        "nan in amc": ("a.amc", re.sub(r"root \S+", "root nan", AMC, count=1), "not a number"),
+        "skeleton": ("a.bvh", bvh.replace("L_Knee", "knie_links"), "unknown skeleton"),
+        "pickle inside": ("a.npz", inner, "not plain numbers"),
+        "0 frames": ("a.npz", changed("amass.npz", **zeros[0]), "0 frames"),
+        "1 frame": ("a.npz", changed("amass.npz", **zeros[1]), "1 frame:"),
+        "0 frames in bvh": ("a.bvh", files.bvh(QPOS[:0]), "frame"),
+        "1 frame in bvh": ("a.bvh", files.bvh(QPOS[:1]), "frame"),
+        "0 frames in amc": ("a.amc", empty, "frame"),
+        "1 frame in amc": ("a.amc", files.asf_amc(QPOS[:1])[1], "frame"),
+        "1 frame in json": ("a.json", json.dumps({"Frames": rows[:1]}).encode(), "2 to"),
+        "fps 0": ("a.npz", changed("amass.npz", mocap_framerate=0.0), "0 frames a second"),
+        "fps 1e9": ("a.npz", changed("amass.npz", mocap_framerate=1e9), "1e+09 frames a second"),
+        "fps nan": ("a.npz", changed("amass.npz", mocap_framerate=np.nan), "nan frames a second"),
+        "frame time 1e-9 s": ("a.bvh", bvh.replace(time, "Frame Time: 1e-9"), "frames a second"),
+        "frame time 0 s": ("a.bvh", bvh.replace(time, "Frame Time: 0"), "a frame time of 0 s"),
+        "bvh in m": ("a.bvh", files.bvh(QPOS, unit=1.0), "unit of length is wrong"),
+        "bvh in mm": ("a.bvh", files.bvh(QPOS, unit=0.001), "unit of length is wrong"),
+        "bomb": ("a.npz", bomb(), "300 MiB"),
+    }
+    for name in LENGTHS:
+        for unit, metres in (("cm", 0.01), ("mm", 0.001)):
+            out[f"{name} in {unit}"] = (name, in_unit(name, metres), "unit of length is wrong")
+    return {k: (n, d.encode() if isinstance(d, str) else d, w) for k, (n, d, w) in out.items()}
+
+
 KINDS = ("missing", "empty", "cut", "noise", "text", "pickle", "format", "other")
+BAD = bad_files()
+
+
+def refused(source: Path, folder: Path, capsys, *options: str) -> str:
+    """The one sentence with which the command refuses a source; it has written nothing."""
+    out, result = folder / "clips", folder / "result.json"
+    args = ["mocap", "import", str(source), "--out", str(out), "--result", str(result)]
+    assert cli.main([*args, *options]) == 2
+    error = capsys.readouterr().err.strip()
+    assert error.startswith("olympics-opt mocap: ") and "\n" not in error
+    assert not out.exists() and not result.exists()
+    return error
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_command_says_one_sentence_and_writes_nothing(kind: str, tmp_path: Path, capsys):
-    source, out = sources(tmp_path)[kind], tmp_path / "clips"
-    result = tmp_path / "result.json"
-    args = ["mocap", "import", str(source), "--out", str(out), "--result", str(result)]
-    assert cli.main(args) == 2
-    error = capsys.readouterr().err.strip()
-    assert error.startswith("olympics-opt mocap: ") and "\n" not in error
-    assert not out.exists() and not result.exists()
+    refused(sources(tmp_path)[kind], tmp_path, capsys)
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_the_command_refuses_a_bad_file(kind: str, tmp_path: Path, capsys):
+    name, data, word = BAD[kind]
+    (tmp_path / name).write_bytes(data)
+    options = []
+    if name.endswith("amc"):
+        (tmp_path / "a.asf").write_text(ASF)
+        (tmp_path / "own.json").write_text(json.dumps(asdict(OWN[1])))
+        options = ["--joint-map", str(tmp_path / "own.json"), "--source-fps", "30"]
+    error = refused(tmp_path / name, tmp_path, capsys, *options)
+    assert name in error and word in error
+
+
+def test_the_command_refuses_a_folder_of_nothing_but_bad_files(tmp_path: Path, capsys):
+    for name in LENGTHS:
+        (tmp_path / "in").mkdir(exist_ok=True)
+        (tmp_path / "in" / name).write_bytes(in_unit(name, 0.001))
+    assert "in/amass.npz: " in refused(tmp_path / "in", tmp_path, capsys)
+
+
+def test_a_good_file_beside_a_bad_one_is_imported(tmp_path: Path, capsys):
+    source, out = tmp_path / "in", tmp_path / "clips"
+    source.mkdir()
+    (source / "bad.npz").write_bytes(in_unit("amass.npz", 0.001))
+    (source / "good.npz").write_bytes(GOOD["amass.npz"])
+    args = ["mocap", "import", str(source), "--out", str(out), "--keep-rejected"]
+    assert cli.main(args) == 1
+    assert "in/bad.npz: its pelvis" in capsys.readouterr().out
+    status = {
+        r["file"]: r["status"] for r in json.loads((out / "import.json").read_text())["files"]
+    }
+    assert status["in/bad.npz"] == "unreadable" and status["in/good.npz"] != "unreadable"
+    assert [p.name for p in out.rglob("*.npz")] == ["good.npz"]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import json
 import os
 import tarfile
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -204,6 +205,40 @@ def test_one_kick_in_two_formats_is_one_motion():
     for side in "LR":
         legs = [r["Pelvis"] * r[f"{side}_Hip"] * r[f"{side}_Knee"] for r in (one, two)]
         assert np.degrees((legs[0].inv() * legs[1]).magnitude()).mean() < 7
+
+
+@real
+def test_real_amass_joints_lie_along_the_chain_of_the_body_table():
+    """Every clip of ``asap_smpl`` by the implementation of its own in ``mocap_files``."""
+    found = 0
+    for recording in recordings(Path(ARCHIVES) / "asap_smpl.tar.xz"):
+        with np.load(io.BytesIO(recording.data)) as motion:
+            place = files.smpl_chain(motion["poses"], motion["trans"] + files.PELVIS)
+        points = read_capture(recording).points
+        for name in place:
+            assert np.abs(points[name] - place[name]).max() < 1e-6, (recording.label, name)
+        found += 1
+    assert found > 40
+
+
+@real
+def test_real_amass_clips_in_other_units_are_refused(tmp_path: Path, capsys):
+    """Every clip of ``asap_smpl`` with ``trans`` in cm or mm, also from a place of its own."""
+    for k, recording in enumerate(recordings(Path(ARCHIVES) / "asap_smpl.tar.xz")):
+        with np.load(io.BytesIO(recording.data)) as old:
+            value = {key: old[key] for key in old.files}
+        for unit in (100, 1000):
+            for start in (0.0, value["trans"][0]):
+                other = files.npz(**{**value, "trans": unit * (value["trans"] - start)})
+                with pytest.raises(ValueError, match="unit of length is wrong"):
+                    read_capture(replace(recording, data=other))
+        if k == 0:
+            (tmp_path / "mm.npz").write_bytes(other)
+    assert (
+        cli.main(["mocap", "import", str(tmp_path / "mm.npz"), "--out", str(tmp_path / "o")]) == 2
+    )
+    assert not (tmp_path / "o").exists()
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
 @real

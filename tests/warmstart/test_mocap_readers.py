@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 from pathlib import Path
@@ -71,19 +70,10 @@ def test_bvh_turns_in_the_order_of_its_channels(order: str):
 
 def test_amass_joints_lie_along_the_chain_of_the_body_table():
     """An implementation of its own: SMPL's chain, offsets of the table, betas 0."""
-    pose = np.load(io.BytesIO(NPZ["smpl"]))
-    table = Path(body_module.__file__).parent / "data" / "body_smpl.csv"
-    rows = {r["body"]: r for r in csv.DictReader(table.open())}
-    turn, place = {}, {}
-    for name, row in rows.items():
-        j = files.SMPL_ORDER.index(name)
-        own = Rotation.from_rotvec(pose["poses"][:, 3 * j : 3 * j + 3])
-        off = np.array([float(row[f"offset_{a}"]) for a in "xyz"]) @ files.AXES  # to y up
-        parent = row["parent"]
-        turn[name] = turn[parent] * own if parent else own
-        place[name] = place[parent] + turn[parent].apply(off) if parent else pose["trans"]
+    motion = np.load(io.BytesIO(NPZ["smpl"]))
+    place = files.smpl_chain(motion["poses"], motion["trans"])
     capture = capture_of("smpl")
-    for name in rows:
+    for name in place:
         ours = capture.points[name] - capture.points["Pelvis"]
         assert np.abs(ours - (place[name] - place["Pelvis"])).max() < 1e-6
 

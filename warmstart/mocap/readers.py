@@ -17,6 +17,7 @@ from warmstart.mocap.capture import Capture
 from warmstart.mocap.deepmimic import read_deepmimic
 from warmstart.mocap.skeleton import JointMap
 from warmstart.mocap.source import MAX_BYTES, Recording
+from warmstart.mocap.units import check_units
 from warmstart.npz import read_member
 
 _BROKEN = (
@@ -50,6 +51,7 @@ def read_capture(
             capture = read_deepmimic(_text(recording.data), fps)
         else:
             raise ValueError(f"'{suffix}' is no format of motions that is known")
+        check_units(capture)
     except ValueError as error:
         raise ValueError(f"{recording.label}: {str(error).splitlines()[0][:300]}") from error
     except _BROKEN as error:
