@@ -40,10 +40,11 @@ def run_list(config: List) -> int:
             console.print(f"[bold]{title}[/bold]: none\n")
             continue
         table = Table(title=title, title_justify="left", title_style="bold", box=None)
-        for name in rows[0]:
+        short = [_short(row) for row in rows]
+        for name in short[0]:
             table.add_column(name, overflow="fold")
-        for row in rows:
-            table.add_row(*(_cell(value) for value in _short(row).values()))
+        for row in short:
+            table.add_row(*(_cell(value) for value in row.values()))
         console.print(table)
         console.print()
     return 0
@@ -112,7 +113,15 @@ def _demonstrations() -> list[dict[str, Any]]:
 
 
 def _short(row: dict[str, Any]) -> dict[str, Any]:
-    """A row for a table: of what a demonstration achieved, what was asked for and its success."""
+    """A row for a table: of what a demonstration achieved, what was asked for and its success; a
+    refined throw in words beside its motion."""
+    if "throw" in row:
+        row = dict(row)
+        if throw := row.pop("throw"):
+            from warmstart.refined_throw import shown
+
+            reason = f". Not certified: {throw['why_not']}" if throw["why_not"] else ""
+            row["motion"] = f"{row['motion']} ({shown(throw)}){reason}"
     asked, achieved = row.get("asked"), row.get("achieved")
     if not isinstance(asked, dict) or not isinstance(achieved, dict):
         return row

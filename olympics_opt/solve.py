@@ -98,6 +98,7 @@ def _solve_one(config: Solve, problem_config: Any, out: Path) -> int:
     found = None
     if certificate.passed and config.track:
         found = make_demonstration(solution, certificate, out)
+        certificate = found.certificate
     elif certificate.passed:
         from warmstart.clip import clip_from_solution
 
@@ -206,7 +207,8 @@ def make_demonstration(
 ) -> Demonstration:
     """Follows a certified solution in MuJoCo with feedback; writes demo.npz where it succeeds.
 
-    Success is what the task's own rules call so; the clip is labelled with what it achieved.
+    Success is what the task's own rules call so; the clip is labelled with what it achieved. A
+    certificate that then says something of the clip is written again.
     """
     from warmstart.demonstration import demonstrate
     from warmstart.tracking import Tracking
@@ -221,6 +223,8 @@ def make_demonstration(
         bar.finish("success" if found.passed else "no success")
     if found.passed and found.clip is not None:
         found.clip.save(out / DEMO)
+        if found.certificate.clip:
+            found.certificate.to_json(out / CERTIFICATE)
     return found
 
 
@@ -304,8 +308,10 @@ def tracking_tiles(tracked: Clip) -> Tiles:
             "by the rules of the sport",
             "" if success is None else "good" if success > 0.5 else "bad",
         ),
-        Tile("link error", f"{100 * tracked.meta['link_error']:.1f} cm", "root mean square"),
     ]
+    if "link_error" in tracked.meta:  # a refined throw follows no path
+        error = f"{100 * tracked.meta['link_error']:.1f} cm"
+        tiles.append(Tile("link error", error, "root mean square"))
     skip = ("success", "foul", "knocked", "bar_height")
     tiles += [
         Tile(f"tracked: {name.replace('_', ' ')}", number(float(value)))
@@ -386,7 +392,11 @@ def _print_outcome(
     if found is not None and found.clip is not None:
         meta = found.clip.meta
         outcome = ", ".join(f"{k} {number(float(v))}" for k, v in meta.get("achieved", {}).items())
-        print(f"tracked in MuJoCo: links {100 * meta['link_error']:.1f} cm off, {outcome}")
+        if "link_error" in meta:
+            outcome = f"links {100 * meta['link_error']:.1f} cm off, {outcome}"
+        print(f"{meta.get('motion', 'tracked in MuJoCo')}: {outcome}")
+        if reason := meta.get("why_not"):
+            print(f"the plan is certified, the clip is not: {reason}")
     if not certificate.passed:
         print(f"not certified, so no demonstration is written: {'; '.join(certificate.failures)}")
     elif found is not None and found.reason:

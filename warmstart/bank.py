@@ -180,8 +180,9 @@ def approach_files(task: str) -> list[Path]:
 
 
 def load_demonstrations(problem: str, strength: str | None = None) -> list[Clip]:
-    """Shipped demonstrations of a problem: certified, tracked in MuJoCo, labelled with what they
-    achieved. ``strength`` keeps those of one strength.
+    """Shipped demonstrations of a problem, of certified plans, played in MuJoCo and labelled with
+    what they achieved; ``meta["certified"]`` says whether the motion itself is certified, which a
+    refined free throw need not be. ``strength`` keeps those of one strength.
 
     Raises ValueError for an unknown problem, or when none is shipped.
     """
@@ -196,12 +197,16 @@ def load_demonstrations(problem: str, strength: str | None = None) -> list[Clip]
 
 def list_demonstrations() -> list[dict[str, Any]]:
     """One row per shipped demonstration, for ``list``: name, problem, asked, achieved, strength,
-    seconds and whether its certificate passed."""
+    seconds, ``motion`` (how the clip was made of the plan), ``plan_certified`` (its certificate
+    passed), ``certified`` (that, and the clip itself is labelled so) and ``throw`` (what the
+    certificate says of a refined free throw, else None)."""
     rows = []
     for path in demonstration_files():
         clip = Clip.load(path)
         certificate = path.with_suffix(".json")
-        passed = certificate.is_file() and json.loads(certificate.read_text())["passed"] is True
+        facts = json.loads(certificate.read_text()) if certificate.is_file() else {}
+        passed = facts.get("passed") is True
+        source = str(clip.meta.get("source")).removeprefix("trajectory optimisation, ")
         rows.append(
             {
                 "name": path.stem,
@@ -210,7 +215,10 @@ def list_demonstrations() -> list[dict[str, Any]]:
                 "achieved": clip.meta.get("achieved"),
                 "strength": clip.meta.get("strength"),
                 "seconds": round(clip.duration, 3),
-                "certified": passed,
+                "motion": clip.meta.get("motion", source),
+                "plan_certified": passed,
+                "certified": passed and clip.meta.get("certified") is True,
+                "throw": facts.get("clip"),
             }
         )
     return rows

@@ -21,7 +21,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +158,9 @@ class Certificate:
     of :mod:`warmstart.feedback`."""
     checks: tuple[Check, ...]
     stats: dict[str, Any]
+    clip: dict[str, Any] = field(default_factory=dict)
+    """What was measured of the clip beside it, where that is another motion than the certified one
+    (:func:`warmstart.refined_throw.record`); else empty. ``passed`` is of the plan alone."""
 
     @property
     def required(self) -> dict[str, tuple[str, float, str]]:
@@ -210,6 +213,7 @@ class Certificate:
                 "checks": [asdict(c) | {"passed": c.passed} for c in self.checks],
                 "stats": self.stats,
             }
+            | ({"clip": self.clip} if self.clip else {})
         )
 
     def to_json(self, path: str | Path) -> None:
@@ -242,6 +246,7 @@ class Certificate:
                 achieved={k: float(v) for k, v in data["achieved"].items() if v is not None},
                 checks=checks,
                 stats=dict(data["stats"]),
+                clip=dict(data.get("clip", {})),
             )
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path} is not a readable certificate: {error}") from error

@@ -20,6 +20,7 @@ from warmstart.clip import Clip, clip_from_solution
 from warmstart.judged import RULES
 from warmstart.outcome import OUTCOMES, link_poses
 from warmstart.refine import Search, refine
+from warmstart.refined_throw import labelled
 from warmstart.replay import FEEDBACK, REPLAY_RATE, Replayed, replay_all
 from warmstart.solution import Solution
 from warmstart.tracking import Tracking, track_best
@@ -30,6 +31,7 @@ class Demonstration:
     """What became of a solution."""
 
     certificate: Certificate
+    """Of the plan."""
     clip: Clip | None
     """The tracked motion; None when the gate refused the solution or it could not be simulated."""
     reason: str
@@ -37,7 +39,8 @@ class Demonstration:
 
     @property
     def passed(self) -> bool:
-        """Certified, and in MuJoCo a success by the task's rules that reaches what was asked."""
+        """Its plan is certified, and in MuJoCo it is a success by the task's rules that reaches
+        what was asked (of a free throw: a basket)."""
         return self.clip is not None and not self.reason
 
 
@@ -52,7 +55,9 @@ def demonstrate(
 ) -> Demonstration:
     """Certifies a solution and tracks it in its task; a strike or throw, whose gate asks for a
     replay that reaches the outcome, is that replay in MuJoCo; a free throw is thrown in its task
-    with the real ball (:mod:`warmstart.refine`).
+    with the real ball (:mod:`warmstart.refine`), which makes it another motion than the certified
+    one: clip and certificate then say what it does in both engines and whether it is certified
+    (:mod:`warmstart.refined_throw`).
 
     A ``certificate`` of the solution, where there is one already, is taken as it is. Raises
     ValueError when the solution's problem is no task.
@@ -101,8 +106,8 @@ def _thrown(
         except RuntimeError as error:
             reason = str(error)
             continue
-        clip.meta.update(certified=True, planned=certificate.achieved.get("planned"))
         if clip.meta["achieved"].get("success") == 1.0:
+            clip, certificate = labelled(clip, certificate)
             return Demonstration(certificate, clip, "")
         reason = f"thrown in MuJoCo, the task calls it no success: {clip.meta['achieved']}"
     return Demonstration(certificate, clip, reason)

@@ -162,6 +162,9 @@ def _case(name: str, result: Result | None, proof: Path | None) -> Case:
             reason = "; ".join(certificate.stats.get("not computed", ()))
         elif not certificate.passed:
             reason = "; ".join(certificate.failures) or "its limits are not those of this version"
+        elif certificate.clip.get("why_not"):
+            reason = f"only its plan: the clip, {certificate.clip['motion']}, is not certified: "
+            reason += certificate.clip["why_not"]
     if result is not None:
         status, problem = result.status, result.problem
         if certificate is not None and not certificate.passed and result.good:

@@ -70,15 +70,21 @@ def numbers_near(path: Path | None, size: int) -> np.ndarray | None:
 
 
 def perform(
-    task: str, strength: Strength, held: str, ctrl: np.ndarray, watch: Callable[[Env], bool]
+    task: str,
+    strength: Strength,
+    held: str,
+    ctrl: np.ndarray,
+    watch: Callable[[Env], bool],
+    *,
+    engine: str = "mujoco",
 ) -> Performance:
-    """Plays targets ``ctrl`` (K, n) (rad), one row a control step, in a task in MuJoCo; then the
-    targets go back to those of action 0. ``held`` names the object of the clip.
+    """Plays targets ``ctrl`` (K, n) (rad), one row a control step, in a task in an engine; then
+    the targets go back to those of action 0. ``held`` names the object of the clip.
 
     ``watch`` is asked after every step, and False is noted for the last one, when the world has
     begun anew. Raises RuntimeError when the simulation diverges.
     """
-    env = make_env(task, num_worlds=1, strength=strength, training=False)
+    env = make_env(task, engine=engine, num_worlds=1, strength=strength, training=False)
     try:
         env.keep_snapshot = True
         scene, body = env.physics.scene, env.physics.scene.body

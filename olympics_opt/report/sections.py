@@ -76,8 +76,13 @@ def certificate_section(certificate: Mapping[str, Any], title: str = "Certificat
     """Every check of a certificate with its figure and limit."""
     checks = certificate["checks"]
     passed = bool(certificate["passed"]) and all(c["passed"] for c in checks)
+    clip = certificate.get("clip", {})
     verdict = Text(
         f"All {len(checks)} checks passed: this motion is a demonstration."
+        if passed and not clip
+        else f"All {len(checks)} checks of the plan passed. The clip is another motion, "
+        f"{clip['motion']}: "
+        + ("it is certified too." if clip["certified"] else f"not certified, {clip['why_not']}.")
         if passed
         else "Not certified: "
         + "; ".join(f"{c['name']} {number(c['value'])}" for c in checks if not c["passed"]),
@@ -93,11 +98,21 @@ def certificate_section(certificate: Mapping[str, Any], title: str = "Certificat
     replays = certificate.get("stats", {}).get("replay")
     return Section(
         title,
-        [verdict, table],
+        [verdict, table, *([_clip_table(clip)] if clip else [])],
         "What the optimiser returned is recomputed by other code, in two engines, on a finer "
         "grid. A motion that fails one check is not used."
         + (f" Replays are {replays}." if replays else ""),
     )
+
+
+def _clip_table(clip: Mapping[str, Any]) -> Table:
+    """What a refined throw does in each engine, beside the plan's release (m, m/s, deg)."""
+    sides = {name: clip[name] for name in ("planned", "mujoco", "drake")}
+    names = dict.fromkeys(n for figures in sides.values() for n in figures)
+    rows: list[list[object]] = [
+        [_words(name), *(figures.get(name, "–") for figures in sides.values())] for name in names
+    ]
+    return Table(["the clip's throw", *sides], rows)
 
 
 def parity_section(rows: Sequence[Mapping[str, Any]]) -> Section:

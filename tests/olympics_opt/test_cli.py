@@ -165,6 +165,26 @@ def test_list_as_json(capsys):
     assert problems >= {"high_jump", "long_jump", "hurdling", "tennis", "javelin"}
     for policy in found["pretrained"]:
         assert Path(policy["path"]).is_file()
+    thrown = {d["name"]: d for d in found["demonstrations"]}["free_throw_1.2m_human"]
+    assert thrown["motion"] == "refined in MuJoCo from a certified throw"
+    assert thrown["plan_certified"] is True
+    assert thrown["certified"] is thrown["throw"]["certified"] is False
+    assert thrown["throw"]["mujoco"]["basket"] == 1.0 and thrown["throw"]["drake"]["basket"] == 0.0
+
+
+def test_a_refined_throw_is_told_apart_in_the_table(capsys, monkeypatch):
+    from olympics_opt import catalogue
+
+    monkeypatch.setenv("COLUMNS", "400")
+    rows = catalogue.catalogue()["demonstrations"]
+    monkeypatch.setattr(catalogue, "catalogue", lambda: {"demonstrations": rows})
+    assert cli.main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    text = " ".join(" ".join(lines).split())
+    for row in rows:
+        if row["throw"]:
+            assert f"Not certified: {row['throw']['why_not']}" in text
+    assert text.count("refined in MuJoCo from a certified throw") == 2
 
 
 SCHEMA = {

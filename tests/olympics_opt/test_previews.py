@@ -25,8 +25,12 @@ def test_every_demonstration_has_a_page_with_its_checks(tmp_path: Path, capsys) 
     for path in demonstration_files():
         page = (tmp_path / "pages" / f"{path.stem}.html").read_text()
         page = html.unescape(page)
-        for check in json.loads(path.with_suffix(".json").read_text())["checks"]:
+        facts = json.loads(path.with_suffix(".json").read_text())
+        for check in facts["checks"]:
             assert check["name"] in page, (path.stem, check["name"])
+        assert ("this motion is a demonstration" in page) == ("clip" not in facts)
+        if "clip" in facts:
+            assert f"not certified, {facts['clip']['why_not']}" in page
 
 
 def test_a_thrown_ball_is_in_the_replay() -> None:
