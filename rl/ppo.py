@@ -57,7 +57,9 @@ class PPOConfig:
     sigma_final: float | None = None
     """Standard deviation at the end of the run, reached geometrically; None keeps ``sigma``."""
     learning_rate: float = 1e-4
-    """First learning rate of the actor."""
+    """First learning rate of the actor. With the KL control, an actor that begins as another policy
+    begins at the least rate of ``learning_rate_limits``: Adam's first steps are of full length
+    whatever the gradient's noise, and the control comes only after them."""
     critic_learning_rate: float = 5e-4
     """Learning rate of the critic, constant."""
     kl_band: tuple[float, float] | None = (0.008, 0.03)
@@ -421,6 +423,8 @@ class PPO:
         except RuntimeError as error:
             raise ValueError(f"the policy's network does not fit the run's: {error}") from error
         self.obs_norm.set_moments(count, mean, std)
+        if self.config.kl_band is not None:
+            self.learning_rate.clamp_(max=self.config.learning_rate_limits[0])
 
     def load_critic(self, extra: dict[str, Tensor]) -> bool:
         """Takes a critic and its statistics where ``extra`` has one that fits; whether it did."""

@@ -14,11 +14,16 @@ from rl.train import train
 from tests.rl.toy import SMALL, A, B, Integrator, Q, R, optimal_cost, toy_config, toy_env
 
 
-def filled_rollout(agent: PPO, rows: int, seed: int) -> tuple[Rollout, torch.Tensor]:
-    """A rollout of made-up numbers, and its raw observations."""
+def filled_rollout(
+    agent: PPO, rows: int, seed: int, spread: float | None = None
+) -> tuple[Rollout, torch.Tensor]:
+    """A rollout of made-up numbers, and its raw observations: unit normal ones, or all ``spread``
+    around the same one."""
     g = torch.Generator().manual_seed(seed)
     r = agent.new_rollout(rows)
     raw = torch.randn(r.obs.shape, generator=g)
+    if spread is not None:
+        raw = torch.randn(r.obs.shape[-1], generator=g) + spread * raw
     with torch.no_grad():
         for t in range(r.steps):
             r.obs[t] = agent.prepare(raw[t])
@@ -222,6 +227,32 @@ def test_control_keeps_the_divergence_of_a_run_near_its_band(tmp_path):
     print(seen)
     assert 0.004 < seen["adaptive"] < 0.06
     assert seen["fixed"] < 0.1 * seen["adaptive"]
+
+
+def test_an_actor_that_begins_as_another_keeps_what_it_knows():
+    """The divergence of the first update, measured from the means and the definition. Rewards and
+    noise are made up: nothing is there to be learned, so all of it is damage. All athletes stand
+    at the same start."""
+    teacher = PPO(40, 28, PPOConfig(hidden=(256, 128)), seed=1)
+
+    def damage(rate: float | None) -> float:
+        agent = PPO(40, 28, PPOConfig(hidden=(256, 128), sigma=0.02), seed=2)
+        agent.load_policy(teacher.actor, torch.zeros(40), torch.ones(40), 1e6)
+        if rate is not None:
+            agent.learning_rate.fill_(rate)
+        rollout, raw = filled_rollout(agent, 64, seed=3, spread=0.1)
+        before = rollout.mean.clone()
+        agent.update(rollout)
+        with torch.no_grad():
+            after = agent.actor(agent.prepare(raw))
+        return float(((after - before) ** 2).sum(-1).mean() / (2 * 0.02**2))
+
+    gentle, sudden = damage(None), damage(PPOConfig().learning_rate)
+    print(f"{gentle:.4f} nats, from the rate of a fresh run {sudden:.4f}")
+    assert gentle < 0.2 * sudden
+    fixed = PPO(40, 28, PPOConfig(hidden=(256, 128), kl_band=None))
+    fixed.load_policy(teacher.actor, torch.zeros(40), torch.ones(40), 1e6)
+    assert float(fixed.learning_rate) == pytest.approx(PPOConfig().learning_rate)
 
 
 def test_paper_preset_is_the_papers_table():
