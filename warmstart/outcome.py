@@ -292,7 +292,7 @@ def _hurdle_rules(
 
 def is_cycle(asked: Mapping[str, float]) -> bool:
     """Whether more than the stride over the hurdle is asked for: the next step as well."""
-    return asked.get("steps", 1.0) > 1.0
+    return bool(asked.get("stride_cycle"))
 
 
 def _step_rules(

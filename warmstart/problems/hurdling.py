@@ -48,8 +48,11 @@ OVERLAP = 0.01
 TOUCH = 0.004
 """Height (m) at which the ball of the lead foot has landed."""
 COARSE = 0.5
-"""Share of the knots with which a cycle is solved first. On all of them key poses led astray: to a
-cost of 1830 instead of 27, after 279 iterations."""
+"""``detail`` with which a cycle is solved first. On the whole grid key poses led astray: to a cost
+of 1830 instead of 27, after 279 iterations."""
+REST = 0.3
+"""Speed (m/s) of the lead foot at the end of the stride from which a cycle is begun, where it shall
+stand."""
 FOOT_SPEED = 4.0
 """The lead foot comes down no faster than this, and sweeps over the ground no faster (m/s)."""
 
@@ -65,7 +68,7 @@ class Config(jumper.Config):
     speed_loss: float = 0.4
     """By how much the speed at the landing, and at the end of a cycle, may differ from that
     (m/s)."""
-    cycle: bool = False
+    cycle: bool = True
     """Whether the stance of the lead leg and the next step of the trail leg follow, to the end of
     the stride cycle."""
     lead: Literal["right", "left"] = "right"
@@ -113,8 +116,13 @@ def hurdle_clearance(ball: Ball, p_W, height):
     return p_W[2] - top - ball.radius * ca.sqrt(1 + (2 * _PARABOLA * dx) ** 2)
 
 
-def transcribe(config: Config, elastic: bool = False) -> Transcription:
-    """The nonlinear program; its parameter is the hurdle's height plus the clearance."""
+def transcribe(
+    config: Config, elastic: bool = False, foot_speed: float = FOOT_SPEED
+) -> Transcription:
+    """The nonlinear program; its parameter is the hurdle's height plus the clearance.
+
+    ``foot_speed`` (m/s): the foot on whose touch-down the motion ends is no faster.
+    """
     body = load_body("smpl", strength=config.strength)
     model = reduce_tree(load_tree(body), jumper.FREE, POSE)
     knots = jumper.scaled(config.detail)
@@ -148,10 +156,10 @@ def transcribe(config: Config, elastic: bool = False) -> Transcription:
     jumper.start_rows(program, speed, sink=(-0.8, 0.0), limb_rate=16.0, swing=lead)
     down = int(program.knots("flight")[-1])
     _over_the_hurdle(program, config)
-    _touch_down(program, config, down, lead)
+    _touch_down(program, config, down, lead, foot_speed)
     if config.cycle:
         recovery_step.rows(program, push, lead)
-        _touch_down(program, config, program.K - 1, push)
+        _touch_down(program, config, program.K - 1, push, foot_speed)
     for end in (0, down):
         program.bound(program.q[end, model.index("Torso_x")], -0.15, 0.15)
         program.bound(program.q[end, model.index("Torso_z")], -0.35, 0.35)
@@ -206,7 +214,9 @@ def _forearm_off_the_thigh(program: Transcription, side: str, knots: np.ndarray)
     program.rows("forearm off the thigh", knots, apart)
 
 
-def _touch_down(program: Transcription, config: Config, knot: int, side: str) -> None:
+def _touch_down(
+    program: Transcription, config: Config, knot: int, side: str, foot_speed: float
+) -> None:
     """A knot at which the ball of a foot reaches the ground under a body that runs on."""
     body, model = program.body, program.model
     other = "L" if side == "R" else "R"
@@ -225,8 +235,8 @@ def _touch_down(program: Transcription, config: Config, knot: int, side: str) ->
         fall = [s[2] for s in speed]
         down = ("ball of the foot down", ca.vertcat(*[x[2] for x in ball]), 0.0, TOUCH)
         slow = [
-            ("foot slides", ca.vertcat(*slide), -FOOT_SPEED, FOOT_SPEED),
-            ("foot comes down", ca.vertcat(*fall), -FOOT_SPEED, 0.0),
+            ("foot slides", ca.vertcat(*slide), -foot_speed, foot_speed),
+            ("foot comes down", ca.vertcat(*fall), -foot_speed, 0.0),
         ]
         return [
             *([] if stands else [down]),
@@ -265,8 +275,9 @@ def first_guess(program: Transcription, config: Config) -> np.ndarray:
     """Key poses of a hurdler along a ballistic root path."""
     off, air = 0.13, 0.46
     durations = (0.065, off - 0.065, air)
-    swing = (-0.3, 0.0, 0.6, 0.9, 0.6, 0.0)
-    push, lead = config.legs
+    t = program.nominal_times(durations)
+    arms = [{"L_Shoulder_z": -s, "R_Shoulder_z": s} for s in (-0.3, 0.0, 0.6, 0.9, 0.6, 0.0)]
+    push, _ = config.legs
     spread = f"{push}_Hip_x", 1.0 if push == "L" else -1.0
     poses = [  # of the take-off leg and of the lead leg; how far the trail leg is spread
         ((-0.5, 0.35, 0.2, 0), (0.2, 1.4, 0, 0), 0.0, {}),
@@ -276,18 +287,11 @@ def first_guess(program: Transcription, config: Config) -> np.ndarray:
         ((-0.8, 1.7, 0, 0), (-1.2, 0.4, 0, 0), 1.0, {"pitch": 0.4, "Torso_y": 0.3}),
         ((-1.2, 1.5, 0, 0), (-0.2, 0.2, 0.2, 0), 0.2, {"pitch": 0.1}),
     ]
-    times = [0, 0.5 * off, off, off + 0.45 * air, off + 0.7 * air, off + air]
-    if config.cycle:
-        durations += recovery_step.DURATIONS
-        swing += recovery_step.ARMS
-        poses += [(first, second, 0.0, trunk) for first, second, trunk in recovery_step.POSES]
-        times += (off + air + np.cumsum(recovery_step.DURATIONS)).tolist()
-    t = program.nominal_times(durations)
-    arms = [{"L_Shoulder_z": -s, "R_Shoulder_z": s} for s in swing]
     frames = []
     for (first, second, wide, trunk), arm in zip(poses, arms, strict=True):
         left, right = (first, second) if push == "L" else (second, first)
         frames.append(jumper.legs(left, right, **{spread[0]: wide * spread[1]}, **trunk, **arm))
+    times = [0, 0.5 * off, off, off + 0.45 * air, off + 0.7 * air, off + air]
     q = jumper.key_frames(program.model, times, frames, t)
     start, take_off, land = 0.86, 1.0, 0.95
     rise = (land - take_off + 4.905 * air**2) / air
@@ -297,11 +301,32 @@ def first_guess(program: Transcription, config: Config) -> np.ndarray:
     q[:, 2] = np.where(
         t < off, start + (take_off - start) * (t / off) ** 2, take_off + rise * fly - 4.905 * fly**2
     )
-    if config.cycle:
-        q[:, 2] = recovery_step.root_path(t, q[:, 2], off + air)
-        recovery_step.plant(program, q, lead)
     jumper.plant_foot(program.model, q, program.knots("flat"), program.knots("toe")[1:], push)
     return program.guess(q, durations)
+
+
+def extended_guess(program: Transcription, config: Config, stride: Solution) -> np.ndarray:
+    """A start point of a cycle: a solved stride over the hurdle, key poses from its landing on."""
+    first = transcribe(replace(config, cycle=False))
+    known, n = first.guess_from(stride), first.K - 1
+    q = np.zeros((program.K, program.model.n))
+    q[: n + 1] = known[first.q]
+    durations = [stride.times[b] - stride.times[a] for _, a, b, _ in stride.phases]
+    durations += recovery_step.DURATIONS
+    t = program.nominal_times(durations)
+    recovery_step.go_on(program, q, t, n, config.run_speed, config.legs)
+    x = program.guess(q, durations)
+    for mine, its in (
+        (program.q, first.q),
+        (program.v, first.v),
+        (program.a, first.a),
+        (program.u, first.u),
+    ):
+        x[mine[:n]] = known[its[:n]]
+    for side in first.sides:
+        for k, index in first.f[side].items():
+            x[program.f[side][k]] = known[index]
+    return x
 
 
 def solve(
@@ -309,20 +334,43 @@ def solve(
     guess: Solution | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> Solution:
-    """The least-effort clearance. See :meth:`warmstart.problems.Problem.solve`."""
+    """The least-effort clearance. See :meth:`warmstart.problems.Problem.solve`.
 
-    if guess is None and config.cycle and config.detail > COARSE:  # too far from key poses
-        own = solve(replace(config, detail=COARSE * config.detail), None, progress)
-        solution = solve(config, own, progress)
-        spent = {k: own.stats[k] + solution.stats[k] for k in ("solve_s", "cpu_s", "iterations")}
-        return replace(solution, stats=solution.stats | spent)
+    A cycle without a guess comes in three stages, of which the figures are the sum: a coarse stride
+    that ends on a foot nearly at rest, the coarse cycle, the cycle.
+    """
+    if guess is not None:
+        return _solved(config, lambda program: program.guess_from(guess), True, progress)
+    if not config.cycle:
+        return _solved(config, lambda program: first_guess(program, config), False, progress)
+    coarse = replace(config, detail=min(config.detail, COARSE))
+    plain = replace(coarse, cycle=False)
+    stride = _solved(plain, lambda program: first_guess(program, plain), False, progress, REST)
+    whole = _solved(
+        coarse, lambda program: extended_guess(program, coarse, stride), False, progress
+    )
+    stages = [stride, whole]
+    if config.detail > COARSE:
+        stages.append(_solved(config, lambda program: program.guess_from(whole), True, progress))
+    names = "solve_s", "cpu_s", "iterations"
+    spent = {name: round(sum(s.stats[name] for s in stages), 2) for name in names}
+    return replace(stages[-1], stats=stages[-1].stats | spent)
+
+
+def _solved(
+    config: Config,
+    start: Callable[[Transcription], np.ndarray],
+    neighbour: bool,
+    progress: Callable[[int, float], None] | None,
+    foot_speed: float = FOOT_SPEED,
+) -> Solution:
+    """One program from a start; raises Infeasible."""
 
     def attempt(elastic: bool) -> tuple[Transcription, Result]:
-        program = transcribe(config, elastic)
-        start = first_guess(program, config) if guess is None else program.guess_from(guess)
+        program = transcribe(config, elastic, foot_speed)
         parameters = [config.hurdle_height + config.clearance]
         return program, jumper.run(
-            program, start, parameters, guess is not None, progress, config.max_iterations
+            program, start(program), parameters, neighbour, progress, config.max_iterations
         )
 
     program, result = attempt(False)
@@ -330,5 +378,5 @@ def solve(
     jumper.check(result, what, lambda: attempt(True))
     asked = {"hurdle_height": config.hurdle_height, "run_speed": config.run_speed}
     if config.cycle:
-        asked["steps"] = 2.0
+        asked["stride_cycle"] = 1.0
     return program.solution("hurdling", asked, result)

@@ -1,16 +1,17 @@
 """The step after a hurdle, which makes a stride cycle of the stride over it.
 
-The lead leg lands on the ball of its foot (``land``), softly: the toes are at rest as they touch, as
-every contact of :mod:`warmstart.transcription` begins. The heel stays up. Then the athlete leaves
-the ground again (``step``) and the trail leg comes down in front of it, which ends the cycle: from
-one touch-down of the take-off foot to its next one.
+The lead leg lands on the ball of its foot (``land``), softly: the toes are at rest as they touch,
+as every contact of :mod:`warmstart.transcription` begins. The heel stays up. Then the athlete
+leaves the ground again (``step``) and the trail leg comes down in front of it, which ends the
+cycle: from one touch-down of the take-off foot to its next one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from warmstart.phases import Phase
 from warmstart.problems import jumper
@@ -28,7 +29,8 @@ POSES = (
     ((-0.9, 1.5, 0.0, 0.0), (0.45, 0.1, 0.2, -0.7), {"pitch": 0.2}),
     ((-0.5, 0.35, 0.2, 0.0), (0.2, 1.4, 0.0, 0.0), {}),
 )
-"""Key poses at the end of both phases: trail leg, lead leg (hip, knee, ankle, toe y), trunk (rad)."""
+"""Key poses at the end of both phases (rad): hip, knee, ankle, toe y of the trail and of the lead
+leg; trunk."""
 ARMS = (-0.6, -0.3)
 """Swing of the arms in them (rad)."""
 
@@ -58,19 +60,32 @@ def rows(program: Transcription, push: str, lead: str) -> None:
     program.bound(program.q[program.knots("land"), toe], None, 0.0)
 
 
-def root_path(t: np.ndarray, z: np.ndarray, down: float) -> np.ndarray:
-    """Heights (K,) of a guess (m) with the ones after the landing at ``down`` (s) put in: a dip in
-    stance and a flight from and to the height of the landing."""
-    off = down + DURATIONS[0]
-    share = np.clip((t - down) / DURATIONS[0], 0.0, 1.0)
-    fly = np.clip(t - off, 0.0, None)
-    land = z[np.searchsorted(t, down - 1e-9)]
-    after = land - 0.2 * share * (1 - share) + 4.905 * fly * (DURATIONS[1] - fly)
-    return np.where(t > down, after, z)
+def go_on(
+    program: Transcription,
+    q: np.ndarray,
+    t: np.ndarray,
+    knot: int,
+    speed: float,
+    legs: tuple[str, str],
+) -> None:
+    """Fills in a guess (K, n) after a knot: key poses, a dip in stance, a flight, at a speed (m/s).
 
-
-def plant(program: Transcription, q: np.ndarray, lead: str) -> None:
-    """Bends the lead leg of a guess (K, n) so that its foot stays where it stands."""
-    stance: Sequence[int] | np.ndarray = program.knots("land")
+    ``t`` (K,) are its times (s), ``legs`` the sides of the leg that took off and of the lead leg.
+    """
+    model, push, lead = program.model, *legs
+    down, off = t[knot], t[knot] + DURATIONS[0]
+    poses = [q[knot]]
+    for (trail, first, trunk), s in zip(POSES, ARMS, strict=True):
+        left, right = (trail, first) if push == "L" else (first, trail)
+        frame = jumper.legs(left, right, **trunk, L_Shoulder_z=-s, R_Shoulder_z=s)
+        poses.append(np.array([frame.get(name, 0.0) for name in model.names]))
+    ends, after = down + np.cumsum([0.0, *DURATIONS]), np.arange(len(t)) > knot
+    q[after] = PchipInterpolator(ends, poses, axis=0)(t[after])
+    share = np.clip((t - down) / DURATIONS[0], 0.0, 1.0)[after]
+    fly = np.clip(t - off, 0.0, None)[after]
+    q[after, 0] = q[knot, 0] + speed * (t - down)[after]
+    q[after, 1] = q[knot, 1]
+    q[after, 2] = q[knot, 2] - 0.2 * share * (1 - share) + 4.905 * fly * (DURATIONS[1] - fly)
+    stance = program.knots("land")
     half = len(stance) // 2
-    jumper.plant_foot(program.model, q, stance[:half], stance[half:], lead)
+    jumper.plant_foot(model, q, stance[:half], stance[half:], lead)
