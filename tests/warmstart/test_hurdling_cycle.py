@@ -193,7 +193,7 @@ def test_both_stances_are_optimal_by_drakes_derivatives(cycle, capsys):
         program = StanceProgram(cycle, stance=stance)
         x = program.reference_point()
         assert program.violation(x) < 1e-5
-        assert program.stationarity(x) < 1.5e-2
+        assert program.stationarity(x) < 2e-2
     jumps = replace(cycle, stats={k: v for k, v in cycle.stats.items() if k != "boxes"})
     stance = StanceProgram(jumps)  # what SNOPT was asked before: a jumper's hips turn less
     assert stance.violation(stance.reference_point()) > 1e-2
