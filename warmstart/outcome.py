@@ -299,20 +299,19 @@ def _step_rules(
     body: Body, times: np.ndarray, qpos: np.ndarray, asked: dict[str, float]
 ) -> dict[str, float]:
     """Of the step after the hurdle: distance to the hurdle from the landing on, how long the lead
-    foot stands, how far it is to the next footprint, the speed before that as a share of the
-    run's."""
+    foot stands, how far its toes are from where the other foot's land, the speed before that as a
+    share of the run's."""
     stride, step = _stride(body, times, qpos), _next_step(body, times, qpos)
     if stride is None or step is None:
         return {}
     (_, down), (off, end) = stride, step
-    points, radii = support(body, qpos[[down, end]])
-    touch = points[..., 2] - radii < TOUCH + 1e-6
-    prints = np.where(touch, points[..., 0], -np.inf).max(1)
+    pos, _ = link_poses(body, qpos[[off - 1, end]])
+    toes = [body.link_index(f"{_feet(body, qpos[k])}_Toe") for k in (off - 1, end)]
     after = qpos[down : end + 1]
     return {
         "clearance after the landing": _hurdle(body).gap(after, asked["hurdle_height"], 0.5),
         "stance of the lead leg": float(times[off] - times[down]),
-        "length of the next step": float(prints[1] - prints[0]),
+        "length of the next step": float(pos[1, toes[1], 0] - pos[0, toes[0], 0]),
         "speed after the next step": _speed(body, times, qpos, end) / asked["run_speed"],
     }
 

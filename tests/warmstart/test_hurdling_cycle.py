@@ -24,8 +24,10 @@ from warmstart.bank import demonstration_files
 from warmstart.certificate import Certificate, certify, required
 from warmstart.clip import Clip
 from warmstart.demonstration import name_of
+from warmstart.drake_nlp import second_opinion
 from warmstart.outcome import OUTCOMES, cleared_hurdle
 from warmstart.solution import Solution
+from warmstart.stance_program import StanceProgram, stances, take_off
 
 BODY = load_body("smpl")
 ASKED = {"hurdle_height": 0.45, "run_speed": 2.0 / 0.6, "stride_cycle": 1.0}
@@ -85,12 +87,12 @@ def at(solution: Solution, phase: str) -> tuple[float, float]:
 
 def test_it_is_a_whole_cycle_from_foot_to_foot(cycle):
     """Left, air, right, air, left: what stands is nearer than 1 mm to the ground in MuJoCo, and
-    nothing but feet comes near it at all."""
+    nothing but feet comes within 2 cm of it."""
     middle = 0.5 * (cycle.times[1:] + cycle.times[:-1])
     down = feet_down(cycle.sample(middle)["qpos"], 1e-3)
     order = [side for i, side in enumerate(down) if i == 0 or side != down[i - 1]]
-    assert order == ["L", "", "R", "", "L"] or order == ["L", "", "R", ""]
-    assert all("X" not in side for side in feet_down(cycle.sample(middle)["qpos"], 0.1))
+    assert order == ["L", "", "R", ""]
+    assert all("X" not in side for side in feet_down(cycle.sample(middle)["qpos"], 0.02))
     last = cycle.sample(cycle.times[-1:])["qpos"]
     assert feet_down(last, 5e-3) == ["L"]
 
@@ -132,7 +134,13 @@ def test_the_gate_asks_more_of_a_cycle_and_passes_this_one(cycle):
     assert len(more) == 4 and more < set(figures)
     land, step = at(cycle, "land"), at(cycle, "step")
     assert land[1] - land[0] < figures["stance of the lead leg"] < land[1] - land[0] + 0.06
-    assert figures["length of the next step"] < 6.4 * (step[1] - land[0])
+    model, toes = build_model(BODY), []
+    for time, foot in ((land[0], "R_Toe"), (step[1], "L_Toe")):
+        data = mujoco.MjData(model)
+        data.qpos[:] = cycle.sample(np.array([time]))["qpos"][0]
+        mujoco.mj_kinematics(model, data)
+        toes.append(data.xpos[model.body(body_name(0, foot)).id, 0])
+    assert figures["length of the next step"] == pytest.approx(toes[1] - toes[0], abs=0.01)
     assert name_of(cycle) == "hurdling_1.067m_cycle_human"
 
 
@@ -175,18 +183,15 @@ def test_hand_made_steps_after_a_hurdle_are_ruled():
         found = judge(BODY, t, qpos, ASKED)
         assert found["success"] == 1.0
         assert found["next_speed"] == pytest.approx(2.0 / 0.6, abs=0.05)
-        assert found["next_step"] == pytest.approx(2.0 / 0.6 * 0.3, abs=0.3)
+        assert found["next_step"] == pytest.approx(2.0 / 0.6 * 0.18, abs=0.04)
     for t, qpos in (step_after("LRR"), step_after("LRL", lift=0.0), step_after("LRL", x=1.0)):
         assert judge(BODY, t, qpos, ASKED)["success"] == 0.0
         stride = {k: v for k, v in ASKED.items() if k != "stride_cycle"}
         assert judge(BODY, t, qpos, stride)["success"] == 1.0
 
 
-def test_both_stances_are_optimal_by_drakes_derivatives(cycle, capsys):
-    pytest.importorskip("pydrake")
-    from warmstart.drake_nlp import second_opinion
-    from warmstart.stance_program import StanceProgram, stances, take_off
-
+def test_both_stances_are_optimal_by_drakes_derivatives(cycle):
+    """And the take-off broke the pose boxes of the jumps, which SNOPT was given before."""
     both = stances(cycle)
     assert [s.first for s in both] == [0, cycle.phases[3][1]] and take_off(cycle) == both[0]
     for stance in both:
@@ -195,9 +200,14 @@ def test_both_stances_are_optimal_by_drakes_derivatives(cycle, capsys):
         assert program.violation(x) < 1e-5
         assert program.stationarity(x) < 2e-2
     jumps = replace(cycle, stats={k: v for k, v in cycle.stats.items() if k != "boxes"})
-    stance = StanceProgram(jumps)  # what SNOPT was asked before: a jumper's hips turn less
-    assert stance.violation(stance.reference_point()) > 1e-2
-    opinion = second_opinion(cycle)
+    program = StanceProgram(jumps)
+    assert program.violation(program.reference_point()) > 1e-2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", [0, 1])
+def test_snopt_betters_neither_stance(cycle, which, capsys):
+    opinion = second_opinion(cycle, stance=stances(cycle)[which])
     with capsys.disabled():
         print(f"\n{opinion.sentence()}")
     assert opinion.agrees and opinion.violation < 1e-5 and abs(opinion.improvement) < 0.01
@@ -213,6 +223,7 @@ def test_shipped_cycles_run_on_in_mujoco():
         achieved = clip.meta["achieved"]
         assert achieved["success"] == 1.0
         down = feet_down(clip.qpos, 5e-3)
+        down = down[down.index("") - 1 :]  # from the last frame on the take-off foot
         order = [side for i, side in enumerate(down) if i == 0 or side != down[i - 1]]
         assert order[:5] == ["L", "", "R", "", "L"]
         gap = gap_to_hurdle(BODY, clip.resample(240.0).qpos, clip.meta["asked"]["hurdle_height"])
