@@ -25,14 +25,6 @@ DURATIONS = (0.13, 0.12)
 SOFT = 0.12
 """Share of the flight, at its end, in which the lead foot may be as low as it likes: it comes down
 without speed, so it is low for a while."""
-UPRIGHT = {
-    "z": (0.85, 1.1),
-    "pitch": (-0.2, 0.25),
-    "Torso_y": (-0.2, 0.2),
-    "Chest_y": (-0.2, 0.2),
-}
-"""Boxes (m, rad) at the end: under an upright trunk, as the cycle began. Without them it ended bent
-over, its hips at 0.80 m, where nobody runs on."""
 POSES = (
     ((-0.9, 1.5, 0.0, 0.0), (0.45, 0.1, 0.2, -0.7), {"pitch": 0.2}),
     ((-0.5, 0.35, 0.2, 0.0), (0.2, 1.4, 0.0, 0.0), {}),
@@ -52,8 +44,7 @@ def phases(knots: Callable[[int], int], lead: str) -> list[Phase]:
 
 
 def rows(program: Transcription, push: str, lead: str) -> None:
-    """Feet off the ground where they do not stand, the heel of the lead foot at all times; an upright
-    trunk at the end.
+    """Feet off the ground where they do not stand, the heel of the lead foot at all times.
 
     ``push``: the side of the trail leg, which is the one that took off.
     """
@@ -65,8 +56,6 @@ def rows(program: Transcription, push: str, lead: str) -> None:
     program.ground(first, step[1:4], margin=0.0)
     program.ground(first, step[4:])
     program.ground(trail, np.arange(flight[-1] + 1, step[-1]))
-    for name, box in UPRIGHT.items():
-        program.bound(program.q[-1, program.model.index(name)], *box)
     toe = program.model.index(f"{lead}_Toe_y")
     program.bound(program.q[program.knots("land"), toe], None, 0.0)
 
