@@ -40,7 +40,7 @@ from warmstart.inverse_dynamics import (
     needed,
 )
 from warmstart.judged import RULES
-from warmstart.outcome import OUTCOMES, support
+from warmstart.outcome import OUTCOMES, is_cycle, support
 from warmstart.replay import FEEDBACK, replay
 from warmstart.solution import Solution
 
@@ -96,6 +96,13 @@ PROBLEM_LIMITS: dict[str, dict[str, tuple[str, float, str]]] = {
         "speed at the landing": (">=", 0.9, "of the run's"),
     },
 }
+CYCLE_LIMITS = {
+    "clearance after the landing": (">=", 0.0, "m"),
+    "stance of the lead leg": (">=", 0.05, "s"),
+    "length of the next step": (">=", 0.5, "m"),
+    "speed after the next step": (">=", 0.9, "of the run's"),
+}
+"""Of a stride over a hurdle that goes on to the end of its cycle."""
 
 
 OPEN_LOOP, CLOSED_LOOP = (
@@ -106,12 +113,16 @@ OPEN_LOOP, CLOSED_LOOP = (
 """What a certificate says of its replays (``stats["replay"]``)."""
 
 
-def required(problem: str, feedback: bool = False) -> dict[str, tuple[str, float, str]]:
-    """What a certificate of a problem must list, where its replays are open loop or with feedback;
-    one of an unknown problem cannot pass, nor one with feedback where only open loops count."""
+def required(
+    problem: str, feedback: bool = False, cycle: bool = False
+) -> dict[str, tuple[str, float, str]]:
+    """What a certificate of a problem must list, where its replays are open loop or with feedback,
+    and of a stride over a hurdle with or without the rest of its ``cycle``; one of an unknown
+    problem cannot pass, nor one with feedback where only open loops count."""
     rules = RULES.get(problem)
     if rules is None:
         out = LIMITS | PROBLEM_LIMITS.get(problem, {"problem is known": ("<=", 0.0, "")})
+        out |= CYCLE_LIMITS if cycle else {}
     else:
         out = LIMITS | strike.limits(rules, feedback)
     if feedback and (rules is None or rules.closed is None):
@@ -165,7 +176,7 @@ class Certificate:
     @property
     def required(self) -> dict[str, tuple[str, float, str]]:
         """What a certificate of this problem must list."""
-        return required(self.problem, bool(self.stats.get(FEEDBACK)))
+        return required(self.problem, bool(self.stats.get(FEEDBACK)), is_cycle(self.asked))
 
     @property
     def passed(self) -> bool:
@@ -277,7 +288,7 @@ def certify(solution: Solution) -> Certificate:
         except Exception as error:  # fail-closed: whatever goes wrong, the check is missing
             broken.append(f"{name}: {type(error).__name__}: {error}")
     feedback = bool(solution.stats.get(FEEDBACK))
-    listed = required(solution.problem, feedback)
+    listed = required(solution.problem, feedback, is_cycle(solution.asked))
     if feedback:
         notes |= {name: "with feedback" for name in listed if name.startswith("replay in ")}
     checks = tuple(

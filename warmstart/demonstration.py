@@ -18,7 +18,7 @@ import numpy as np
 from warmstart.certificate import Certificate, certify
 from warmstart.clip import Clip, clip_from_solution
 from warmstart.judged import RULES
-from warmstart.outcome import OUTCOMES, link_poses
+from warmstart.outcome import OUTCOMES, is_cycle, link_poses
 from warmstart.refine import Search, refine
 from warmstart.refined_throw import labelled
 from warmstart.replay import FEEDBACK, REPLAY_RATE, Replayed, replay_all
@@ -169,7 +169,7 @@ def _held(played: Replayed, rows: np.ndarray) -> np.ndarray:
 
 def name_of(solution: Solution) -> str:
     """Of a demonstration's file: problem, side of a stroke or kind of punch, outcome, steps before
-    it, strength, style of a jump."""
+    it or whether a stride goes on after it, strength, style of a jump."""
     problem, options = solution.problem, solution.stats.get("options", {})
     side = options.get("side", options.get("punch"))
     rules = RULES.get(problem)
@@ -177,6 +177,7 @@ def name_of(solution: Solution) -> str:
     unit = rules.unit.replace("/", "p") if rules else "m"
     step = ["step"] if options.get("approach") else []
     step += ["steps"] if options.get("from_start") else []
+    step += ["cycle"] if is_cycle(solution.asked) else []
     words = [problem, *([side] if side else []), f"{asked:g}{unit}", *step, solution.strength]
     if solution.stats.get("style", "tuck") != "tuck":
         words.append(solution.stats["style"])

@@ -5,7 +5,7 @@ The same functions measure a planned motion, its replays and tracked clips, from
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import mujoco
@@ -222,22 +222,47 @@ def _stride(body: Body, times: np.ndarray, qpos: np.ndarray) -> tuple[int, int] 
     off, down = flight
     if not qpos[off, 0] < hurdling.FIRST_X < qpos[down, 0]:
         return None
-    points, radii = support(body, qpos[[off - 1, down]])
+    feet = [_feet(body, qpos[off - 1]), _feet(body, qpos[down])]
+    return (off, down) if feet in (["L", "R"], ["R", "L"]) else None
+
+
+def _feet(body: Body, row: np.ndarray) -> str | None:
+    """Side of the foot on which a frame (7 + n,) stands, ``LR`` for both; None where something else
+    touches the ground or nothing does."""
+    points, radii = support(body, row[None])
     owner = Geometry(body, "cpu").owner.tolist()
-    feet = []
-    for row in points[..., 2] - radii < TOUCH + 1e-6:
-        touching = {body.links[owner[i]].name for i in np.flatnonzero(row)}
-        if not all(name.endswith(("Ankle", "Toe")) for name in touching):
-            return None
-        feet.append({name[0] for name in touching})
-    return (off, down) if feet in ([{"L"}, {"R"}], [{"R"}, {"L"}]) else None
+    low = np.flatnonzero(points[0, :, 2] - radii < TOUCH + 1e-6)
+    touching = {body.links[owner[i]].name for i in low}
+    if not touching or not all(name.endswith(("Ankle", "Toe")) for name in touching):
+        return None
+    return "".join(sorted({name[0] for name in touching}))
+
+
+def _next_step(body: Body, times: np.ndarray, qpos: np.ndarray) -> tuple[int, int] | None:
+    """First frame of the flight after the landing beyond the hurdle and first frame after it.
+
+    None where there is no stride over the hurdle, where the next flight is not one from the lead
+    foot alone to the other one, or where anything else touches the ground before it.
+    """
+    stride = _stride(body, times, qpos)
+    if stride is None:
+        return None
+    down = stride[1]
+    flight = _flight(body, times[down:], qpos[down:])
+    if flight is None or flight[0] == 0 or down + flight[1] >= len(qpos):
+        return None
+    off, end = down + flight[0], down + flight[1]
+    lead = _feet(body, qpos[down])
+    if any(_feet(body, row) != lead for row in qpos[down:off]):
+        return None
+    return (off, end) if {lead, _feet(body, qpos[end])} == {"L", "R"} else None
 
 
 def cleared_hurdle(body: Body, times: np.ndarray, qpos: np.ndarray) -> float:
     """Top (m, to 2 mm) of the highest first hurdle that one flight clears without touching.
 
     NaN where the root does not cross the hurdle in one flight from one foot to the other. What
-    happens after the landing is not the clearance.
+    happens after the landing is not the clearance (of a cycle it is a check of its own).
     """
     stride = _stride(body, times, qpos)
     if stride is None:
@@ -257,10 +282,37 @@ def _hurdle_rules(
     points, radii = support(body, qpos[down : down + 1])
     touch = points[0, :, 2] - radii < TOUCH + 1e-6
     whole = qpos[: down + 1]
-    return {
+    found = {
         "clearance over the hurdle": _hurdle(body).gap(whole, asked["hurdle_height"], 0.5),
         "landing beyond the hurdle": float(points[0, touch, 0].min()) - hurdling.FIRST_X,
         "speed at the landing": _speed(body, times, qpos, down) / asked["run_speed"],
+    }
+    return found | (_step_rules(body, times, qpos, asked) if is_cycle(asked) else {})
+
+
+def is_cycle(asked: Mapping[str, float]) -> bool:
+    """Whether more than the stride over the hurdle is asked for: the next step as well."""
+    return bool(asked.get("stride_cycle"))
+
+
+def _step_rules(
+    body: Body, times: np.ndarray, qpos: np.ndarray, asked: dict[str, float]
+) -> dict[str, float]:
+    """Of the step after the hurdle: distance to the hurdle from the landing on, how long the lead
+    foot stands, how far its toes are from where the other foot's land, the speed before that as a
+    share of the run's."""
+    stride, step = _stride(body, times, qpos), _next_step(body, times, qpos)
+    if stride is None or step is None:
+        return {}
+    (_, down), (off, end) = stride, step
+    pos, _ = link_poses(body, qpos[[off - 1, end]])
+    toes = [body.link_index(f"{_feet(body, qpos[k])}_Toe") for k in (off - 1, end)]
+    after = qpos[down : end + 1]
+    return {
+        "clearance after the landing": _hurdle(body).gap(after, asked["hurdle_height"], 0.5),
+        "stance of the lead leg": float(times[off] - times[down]),
+        "length of the next step": float(pos[1, toes[1], 0] - pos[0, toes[0], 0]),
+        "speed after the next step": _speed(body, times, qpos, end) / asked["run_speed"],
     }
 
 
@@ -268,21 +320,29 @@ def _hurdle_judge(
     body: Body, times: np.ndarray, qpos: np.ndarray, asked: dict[str, float]
 ) -> dict[str, float]:
     """Success: the asked hurdle is not touched, the other foot lands first at ``KEPT`` of the
-    asked speed, and nothing but that foot has touched the ground when the motion ends."""
+    asked speed, and nothing but feet has touched the ground when the motion ends. Of a cycle also:
+    the next step is one from foot to foot, ends at that speed and does not touch the hurdle."""
     found = _hurdle_rules(body, times, qpos, asked)
     if not found:
         return {"success": 0.0}
     gap, kept = found["clearance over the hurdle"], found["speed at the landing"]
+    step = {}
+    if "speed after the next step" in found:
+        step["next_step"] = found["length of the next step"]
+        step["next_speed"] = found["speed after the next step"] * asked["run_speed"]
+        gap = min(gap, found["clearance after the landing"])
+    on = step.get("next_speed", 0.0) >= KEPT * asked["run_speed"] or not is_cycle(asked)
     _, down = _flight(body, times, qpos) or (0, 0)
     points, radii = support(body, qpos[down:])
     owner = np.array([link.name[2:] in ("Ankle", "Toe") for link in body.links])
     others = ~owner[Geometry(body, "cpu").owner.numpy()]
     fell = bool((points[:, others, 2] - radii[others] < TOUCH).any()) or len(points) <= 1
     return {
-        "success": float(gap >= 0.0 and kept >= KEPT and not fell),
+        "success": float(gap >= 0.0 and kept >= KEPT and on and not fell),
         "clearance": gap,
         "hurdle_height": asked["hurdle_height"],
         "landing_speed": kept * asked["run_speed"],
+        **step,
     }
 
 

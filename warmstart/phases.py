@@ -104,3 +104,8 @@ class Bounds:
     def limits(self) -> dict[str, float]:
         """The bounds that no coordinate names: what a second opinion must use as well."""
         return {k: v for k, v in vars(self).items() if isinstance(v, float)}
+
+    def boxes(self) -> dict[str, dict[str, tuple[float, float]]]:
+        """The others, ``position`` and ``rate``, by coordinate name: as much a part of the problem,
+        for what one problem forbids another one may need."""
+        return {"position": dict(self.position), "rate": dict(self.rate)}

@@ -27,10 +27,15 @@ OUTCOME = {
 BESIDES = {
     "high_jump": {"clearance": "over the bar {:.3f} m"},
     "long_jump": {"takeoff_speed": "take-off at {:.2f} m/s"},
-    "hurdling": {"clearance": "over the hurdle {:.3f} m", "landing_speed": "lands at {:.2f} m/s"},
+    "hurdling": {
+        "clearance": "over the hurdle {:.3f} m",
+        "landing_speed": "lands at {:.2f} m/s",
+        "next_step": "next step {:.2f} m",
+        "next_speed": "at {:.2f} m/s",
+    },
     "fencing": {"miss": "{:.3f} m from the target", "tip_speed": "tip at {:.2f} m/s"},
 }
-"""What else the clip achieved, in words."""
+"""What else the clip achieved, in words; not every clip has all of it."""
 HEAD = """# Asked and reached
 
 Written by `python -m warmstart.reached` from the shipped clips and their certificates. *Planned* is
@@ -74,7 +79,8 @@ def reached(path: Path) -> Reached:
     proof = json.loads(path.with_suffix(".json").read_text())["achieved"]
     name = OUTCOME[problem]
     asked = clip.meta["asked"]
-    words = [text.format(achieved[key]) for key, text in BESIDES[problem].items()]
+    besides = BESIDES[problem].items()
+    words = [text.format(achieved[key]) for key, text in besides if key in achieved]
     if "run_speed" in asked:
         words.append(f"asked to run at {asked['run_speed']:g} m/s")
     return Reached(

@@ -3,7 +3,8 @@
 Variables are states, accelerations, torques and forces at the knots of a :class:`Solution`;
 accelerations are linear between knots, so with the timing given the integration rows are linear.
 Rigid-body terms come from a :class:`ReducedPlant` through AutoDiff. State and acceleration at both
-ends are given. Left out are clearances other than between a swinging sole and the ground.
+ends are given. Left out are clearances other than between a sole that does not stand, or a raised
+heel, and the ground.
 """
 
 # The stubs of Drake type arrays more narrowly than they are.
@@ -40,7 +41,7 @@ ACCELERATION_SCALE, RATE_SCALE = 50.0, 5.0
 
 @dataclass(frozen=True)
 class Stance:
-    """The last stance before a flight, cut from a :class:`Solution`."""
+    """A stance before a flight, cut from a :class:`Solution`."""
 
     first: int
     last: int
@@ -49,30 +50,39 @@ class Stance:
     """Contact points that push, per knot; none at the first, where the foot only touches."""
 
 
-def last_stance(solution: Solution) -> Stance:
-    """The uninterrupted contact before the last flight of a solution.
+def stances(solution: Solution) -> tuple[Stance, ...]:
+    """Every uninterrupted contact before a flight, in order. Empty where no flight follows one."""
+    contact = [bool(active) for *_, active in solution.phases]
+    out = []
+    for end in range(len(contact) - 1):
+        if not contact[end] or contact[end + 1]:
+            continue
+        begin = end
+        while begin > 0 and contact[begin - 1]:
+            begin -= 1
+        first, last = solution.phases[begin][1], solution.phases[end][2]
+        active = []
+        for k in range(first, last + 1):
+            points = set(range(len(solution.contact_points)))
+            for _, a, b, pushing in solution.phases:
+                if a <= k <= b:
+                    points &= set(pushing)
+            active.append(tuple(sorted(points)) if k > first else ())
+        out.append(Stance(first, last, tuple(active)))
+    return tuple(out)
+
+
+def take_off(solution: Solution) -> Stance:
+    """The stance before the longest flight of a solution: the one that decides it.
 
     Raises ValueError when no flight follows a stance.
     """
-    contact = [bool(active) for *_, active in solution.phases]
-    for i in range(len(contact) - 1, 0, -1):
-        if not contact[i] and contact[i - 1]:
-            end = i - 1
-            begin = end
-            while begin > 0 and contact[begin - 1]:
-                begin -= 1
-            break
-    else:
+    found = stances(solution)
+    if not found:
         raise ValueError(f"solution of '{solution.problem}' has no flight after a stance")
-    first, last = solution.phases[begin][1], solution.phases[end][2]
-    active = []
-    for k in range(first, last + 1):
-        points = set(range(len(solution.contact_points)))
-        for _, a, b, pushing in solution.phases:
-            if a <= k <= b:
-                points &= set(pushing)
-        active.append(tuple(sorted(points)) if k > first else ())
-    return Stance(first, last, tuple(active))
+    ends = [stance.first for stance in found[1:]] + [len(solution.times) - 1]
+    flights = [solution.times[end] - solution.times[s.last] for s, end in zip(found, ends)]
+    return found[int(np.argmax(flights))]
 
 
 class StanceProgram:
@@ -84,11 +94,14 @@ class StanceProgram:
         weights: Weights | None = None,
         bounds: Bounds | None = None,
         held_limits: Sequence[str] = HELD_LIMITS,
+        stance: Stance | None = None,
     ) -> None:
-        self.solution, self.stance = solution, last_stance(solution)
+        """``stance``: the one of :func:`take_off` by default."""
+        self.solution, self.stance = solution, stance or take_off(solution)
         self.weights = weights or Weights(**solution.stats.get("weights", {}))
         limits = solution.stats.get("bounds", {})
-        self.bounds = bounds or Bounds(boxes(POSITION), boxes(RATE), **limits)
+        table = solution.stats.get("boxes", {"position": boxes(POSITION), "rate": boxes(RATE)})
+        self.bounds = bounds or Bounds(**table, **limits)
         stance = self.stance
         keep = slice(stance.first, stance.last + 1)
         hinges = solution.qpos[:, 7:]
@@ -186,6 +199,7 @@ class StanceProgram:
         """The toe link of a pushing foot does not move; a swinging sole stays above ground."""
         model, n = self.model, self.model.n
         solution, stance = self.solution, self.stance
+        pushing = {solution.contact_points[i][0] for points in stance.active for i in points}
         for k in range(1, self.K - 1):
             x = np.concatenate([self.q[k], self.v[k]])
             # A side stands at a knot if it pushes in a phase on either side of that knot.
@@ -202,18 +216,23 @@ class StanceProgram:
                 toe = f"{side}_Toe_y"
                 if f"{side}_Ankle" in touching and toe in model.names:  # a flat foot is rigid
                     self.program.AddBoundingBoxConstraint(0, 0, self.v[k, model.names.index(toe)])
-            self._add_clearance(k, standing)
+            for side in sorted({"L", "R"} - standing):
+                self._add_clearance(k, sole_points(model.body, side), 0.01)
+            for side in sorted(standing):
+                if f"{side}_Ankle" not in pushing:  # it stands on its toes all the time
+                    self._add_clearance(k, sole_points(model.body, side)[:2], 0.0)
 
-    def _add_clearance(self, k: int, standing: set[str]) -> None:
+    def _add_clearance(
+        self, k: int, points: Sequence[tuple[str, tuple[float, float, float]]], margin: float
+    ) -> None:
+        """Points of a foot stay ``margin`` (m) above the ground, or where they are below that."""
         model = self.model
-        for side in sorted({"L", "R"} - standing):
-            points = sole_points(model.body, side)
-            floor = np.minimum(model.heights(self.q_ref[k], points), 0.01)
+        floor = np.minimum(model.heights(self.q_ref[k], points), margin)
 
-            def height(q: np.ndarray, points=points) -> np.ndarray:
-                return model.heights(q, points) / 0.1
+        def height(q: np.ndarray) -> np.ndarray:
+            return model.heights(q, points) / 0.1
 
-            self.program.AddConstraint(height, floor / 0.1, np.full(len(points), 50.0), self.q[k])
+        self.program.AddConstraint(height, floor / 0.1, np.full(len(points), 50.0), self.q[k])
 
     def _add_intervals(self) -> None:
         """Linear acceleration between knots (linear rows, as the timing is given), and the cost."""

@@ -372,7 +372,8 @@ class Transcription:
                 f"placement {side}", [self.q[starts], self.v[starts], self.a[starts]], place
             )
             for first in starts:
-                self.fix(self.q[first, model.index(f"{side}_Toe_y")], 0.0)
+                if first in self.toe_flat_knots(side):  # else it lands with its heel up
+                    self.fix(self.q[first, model.index(f"{side}_Toe_y")], 0.0)
             self.program.block(f"stance {side}", [self.q[held], self.v[held]], still)
 
     def touch_down(self, side: str, foot_speed: float, lift: float) -> None:
@@ -621,6 +622,7 @@ class Transcription:
                 "variables": len(self.program.lower),
                 "weights": asdict(self.weights),
                 "bounds": self.bounds.limits(),
+                "boxes": self.bounds.boxes(),
                 **self._touch_down_stats(x),
                 **stats,
             },

@@ -24,7 +24,7 @@ from warmstart.drake_nlp import second_opinion
 from warmstart.reduced_plant import ReducedPlant
 from warmstart.rigid_body import load_tree, reduce_tree, root_rate_matrix
 from warmstart.solution import Solution
-from warmstart.stance_program import StanceProgram, last_stance
+from warmstart.stance_program import StanceProgram, take_off
 from warmstart.transcription import Weights
 
 DATA = Path(__file__).parent / "data"
@@ -154,7 +154,7 @@ def test_wrong_torques_do_not_pass(solution):
 def test_a_solution_without_flight_is_refused(solution):
     standing = replace(solution, phases=(("flat", 0, len(solution.times) - 1, (0, 1)),))
     with pytest.raises(ValueError, match="no flight after a stance"):
-        last_stance(standing)
+        take_off(standing)
 
 
 def test_unknown_hinge_is_named():

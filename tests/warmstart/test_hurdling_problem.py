@@ -12,7 +12,8 @@ import torch
 from rl.config import load_starts
 from sports import hurdling as task
 from sports.env import make_env
-from sports.humanoid.body import Body, load_body
+from sports.humanoid.body import load_body
+from tests.warmstart.hurdle_gap import gap_to_hurdle
 from warmstart import rotation
 from warmstart.bank import demonstration_files, load_demonstrations
 from warmstart.clip import Clip
@@ -21,7 +22,7 @@ from warmstart.problems import Infeasible, hurdling, jumper
 from warmstart.solution import Solution
 
 BODY = load_body("smpl")
-COARSE = hurdling.Config(detail=0.5)
+COARSE = hurdling.Config(detail=0.5, cycle=False)
 
 
 @pytest.fixture(scope="module")
@@ -36,31 +37,6 @@ def finer(solution: Solution) -> np.ndarray:
     """Five times as many times as the optimiser had."""
     k = np.arange(5 * (len(solution.times) - 1) + 1) / 5
     return np.interp(k, np.arange(len(solution.times)), solution.times)
-
-
-def gap_to_hurdle(body: Body, qpos: np.ndarray, height: float) -> np.ndarray:
-    """(T,) distance of the athlete from the hurdle: points sampled in every shape, less the
-    radius of a capsule, against the distance from a box in closed form."""
-    pos, quat = link_poses(body, qpos)
-    half = np.array([task.HALF_THICKNESS, task.HALF_WIDTH, height / 2])
-    middle = np.array([task.FIRST_X, 0.0, height / 2])
-    best = np.full(len(qpos), np.inf)
-    for i, link in enumerate(body.links):
-        for shape in link.shapes:
-            center = np.array(shape.center)
-            if shape.end is None:
-                grid = np.linspace(-1.0, 1.0, 9)
-                cube = np.stack(np.meshgrid(grid, grid, grid), -1).reshape(-1, 3)
-                points, radius = center + cube * np.array(shape.size), 0.0
-            else:
-                share = np.linspace(0.0, 1.0, 41)[:, None]
-                points, radius = center + share * (np.array(shape.end) - center), shape.size[0]
-            for point in points:
-                p_W = pos[:, i] + rotation.rotate(quat[:, i], np.tile(point, (len(qpos), 1)))
-                d = np.abs(p_W - middle) - half
-                outside = np.linalg.norm(np.maximum(d, 0.0), axis=1)
-                best = np.minimum(best, outside + np.minimum(d.max(1), 0.0) - radius)
-    return best
 
 
 def test_every_point_of_the_athlete_is_clear_of_the_hurdle(stride):
@@ -134,7 +110,12 @@ def test_impossible_options_are_one_sentence():
 @pytest.mark.slow
 def test_a_hurdle_at_a_creep_is_infeasible_and_says_why():
     config = hurdling.Config(
-        hurdle_height=1.2, run_speed=3.0, speed_loss=0.05, detail=0.3, max_iterations=60
+        hurdle_height=1.2,
+        run_speed=3.0,
+        speed_loss=0.05,
+        cycle=False,
+        detail=0.3,
+        max_iterations=60,
     )
     with pytest.raises(Infeasible, match=r"a hurdle of 1\.2 m at 3 m/s.*('.+' is not met| %)"):
         hurdling.solve(config)

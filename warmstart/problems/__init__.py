@@ -119,7 +119,7 @@ PROBLEMS: dict[str, Problem] = {
         ),
         Problem(
             name="hurdling",
-            summary="one stride over a hurdle of given height at a given run speed",
+            summary="one stride cycle over a hurdle of given height at a given run speed",
             outcome="hurdle_height",
             unit="m",
             sweep=(0.762, 0.838, 0.914, 0.991, 1.067),
