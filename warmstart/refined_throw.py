@@ -2,10 +2,10 @@
 
 What is certified of a free throw is its plan, with the ball rigid on a hand. The clip beside the
 certificate is another motion: :mod:`warmstart.refine` changed the plan's targets until MuJoCo's
-task counted a basket, or :mod:`warmstart.robust_throw` for both engines. So the clip is played again
-with the real ball, from the task's own start and by the task's own rules, in MuJoCo and in Drake.
-The ball's release is compared with the shot that was asked for: the one from where the ball is let
-go that rises to the asked apex and falls through the middle of the ring. The clip is called
+task counted a basket, or :mod:`warmstart.robust_throw` for both engines. So the clip is played
+again with the real ball, from the task's own start and by the task's own rules, in MuJoCo and in
+Drake. The ball's release is compared with the shot that was asked for: the one from where the ball
+is let go that rises to the asked apex and falls through the middle of the ring. The clip is called
 certified only where its plan is, and speed and direction keep the gate's limits for a throw in both
 engines. What noise on its targets does to it is recorded beside that.
 

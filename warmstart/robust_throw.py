@@ -9,7 +9,8 @@ Drake's (:mod:`warmstart.other_worlds`). What counts is the mean of the copies a
 Drake itself is a hundred times as slow. It throws only the middle of what was found, a few times.
 By what its throws then differ from those of its stand-ins, the stand-ins are corrected, and the
 search goes on: space mapping (Bandler et al. 1994, IEEE Transactions on Microwave Theory and
-Techniques 42(12)). Kept is the middle with the best throws in the two engines themselves.
+Techniques 42(12)). It ends with a middle that is a basket of the task and whose throws in the two
+engines themselves are good enough.
 
 ``python -m warmstart.robust_throw SOLUTION.npz --out DIR`` writes ``free_throw_..._human.npz`` and
 the certificate of its plan beside it, with what the clip does in both engines
@@ -65,10 +66,12 @@ class Search:
     """Of a round."""
     rounds: int = 24
     """Before the first throws in Drake."""
-    turns: int = 2
-    """Corrections by Drake..."""
+    turns: int = 6
+    """Corrections by Drake at most..."""
     again: int = 6
     """... and the rounds after each."""
+    level: float = 0.15
+    """A basket of the task whose throws in both engines cost less than this (m) ends the search."""
     seed: int = 0
 
 
@@ -194,15 +197,16 @@ def search(
     threads: int = 0,
     progress: Callable[[Progress], None] | None = None,
 ) -> Clip:
-    """The throw with the best copies in both engines, played in the task from its own start, with
-    its ``numbers``; ``near`` (P,) is where to begin. Whether it goes in is for the caller to see.
+    """The first basket whose throws in both engines are good enough (``Search.level``), else the
+    best, played in the task from its own start, with its ``numbers``; ``near`` (P,) is where to
+    begin. Whether it goes in is for the caller to see.
 
     Raises RuntimeError when the simulation of a middle diverges.
     """
     settings = settings or Search()
     crowd = Crowd(solution, settings.candidates, threads)
     sought = CrossEntropy(len(UNITS), settings.candidates, settings.seed, near=near)
-    done, kept, least = 0, sought.mean, np.inf
+    done, found, least = 0, None, (True, np.inf)
 
     def tell(cost: float, off: np.ndarray, drake: bool) -> None:
         if progress is not None:
@@ -220,12 +224,17 @@ def search(
         off = crowd.visit(sought.mean, 1000 * settings.seed + 500 + turn)
         cost = float(total(off))
         tell(cost, off, True)
-        if cost < least:
-            kept, least = sought.mean.copy(), cost
+        clip = throw(solution, crowd.thrower, sought.mean)
+        rank = (clip.meta["achieved"].get("success") != 1.0, cost)
+        if found is None or rank < least:
+            numbers = [round(float(x), 6) for x in sought.mean]
+            found = replace(clip, meta=clip.meta | {"motion": MOTION, "numbers": numbers})
+            least = rank
+        if least <= (False, settings.level):
+            break
     crowd.drake.close()
-    clip = throw(solution, crowd.thrower, kept)
-    numbers = [round(float(x), 6) for x in kept]
-    return replace(clip, meta=clip.meta | {"motion": MOTION, "numbers": numbers})
+    assert found is not None
+    return found
 
 
 def demonstrate(clip: Clip, certificate: Certificate) -> Demonstration:
