@@ -356,13 +356,12 @@ def assert_as_recorded(path: Path, engine: str, slack: float = 1.0) -> None:
 
 
 def test_the_record_of_a_clip_is_what_mujoco_does():
-    """Of the throw of 1.2 m."""
-    assert_as_recorded(CLIPS[1], "mujoco")
+    assert_as_recorded(CLIPS[0], "mujoco")
 
 
 def test_the_record_of_a_clip_is_what_drake_does():
-    """Its contacts are the more chaotic: targets rounded to 32 bits turn a throw by 0.2 degrees."""
-    assert_as_recorded(CLIPS[0], "drake", slack=3.0)
+    """Of the shorter throw, for time: Drake needs a second for a tenth of one."""
+    assert_as_recorded(CLIPS[1], "drake", slack=3.0)
 
 
 @pytest.mark.parametrize("path", CLIPS, ids=lambda p: p.stem)
