@@ -1,8 +1,8 @@
 """From a solution to a demonstration: certified, tracked in MuJoCo, labelled with what it achieved.
 
-This is what made the shipped clips: ``python -m warmstart.demonstration SOLUTION.npz... --out DIR``
-writes, for each solution that passes, ``PROBLEM_ASKED_STRENGTH[_STYLE].npz`` and its certificate
-beside it.
+``python -m warmstart.demonstration SOLUTION.npz... --out DIR`` writes, for each solution that
+passes, ``PROBLEM_ASKED_STRENGTH[_STYLE].npz`` and its certificate beside it. This is what made the
+shipped clips, but the free throws: those are of :mod:`warmstart.robust_throw`.
 """
 
 from __future__ import annotations

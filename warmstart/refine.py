@@ -75,7 +75,20 @@ class Refined:
         return self.clip.meta["achieved"].get("success") == 1.0
 
 
-class _Thrower:
+@dataclass(frozen=True)
+class Flight:
+    """The ball of N throws at the end of a candidate's last control step."""
+
+    place: np.ndarray
+    velocity: np.ndarray
+    """(N, 3) of its centre, world (m, m/s)."""
+    before: np.ndarray
+    """(N, 3) its velocity one control step earlier (m/s)."""
+    lowest: np.ndarray
+    """(N,) how low it sank before the release (m)."""
+
+
+class Thrower:
     """Candidates in MuJoCo, from the task's start."""
 
     def __init__(self, solution: Solution, worlds: int, threads: int) -> None:
@@ -109,31 +122,51 @@ class _Thrower:
         out = out.reshape(steps, parts, -1).mean(1)
         return np.clip(out, self.hold - self.limit, self.hold + self.limit)
 
-    def judge(self, numbers: np.ndarray) -> np.ndarray:
-        """(N,) cost of candidates (N, P): where the ball would come down and how high it goes, a
-        ball that sinks too low or is not free, and the size of the changes."""
-        count, scene, worlds = len(numbers), self.scene, self.worlds
-        ctrl = np.stack([self.targets(row, self.steps) for row in numbers])
-        worlds.put(count, scene.default_qpos(), np.zeros(scene.nv), np.zeros(scene.nv))
+    def fly(self, worlds: Worlds, ctrl: np.ndarray, start: np.ndarray | None = None) -> Flight:
+        """The throws of targets (N, K, n) (rad) in worlds of the task, from ``start`` (nq,) at rest
+        (None: the task's own), until ``WATCHED`` after the release."""
+        count, scene = len(ctrl), worlds.scene
+        worlds.put(
+            count,
+            scene.default_qpos() if start is None else start,
+            np.zeros(scene.nv),
+            np.zeros(scene.nv),
+        )
         ball, rate = scene.object_qpos("ball"), scene.object_qvel("ball")
-        lowest, before, step = np.full(count, np.inf), np.zeros((count, 3)), scene.control_timestep
+        lowest, before = np.full(count, np.inf), np.zeros((count, 3))
         for k in range(self.steps):
             before = worlds.qvel[:count, rate][:, :3].copy()
             worlds.step(ctrl[:, k])
-            if k * step < self.release:
+            if k * scene.control_timestep < self.release:
                 lowest = np.minimum(lowest, worlds.qpos[:count, ball][:, 2])
         place, velocity = worlds.qpos[:count, ball][:, :3], worlds.qvel[:count, rate][:, :3]
-        push = np.linalg.norm((velocity - before) / step + (0.0, 0.0, GRAVITY), axis=1)
-        cost = 0.01 * (numbers**2).sum(1) + 5.0 * np.maximum(LOWEST + 0.02 - lowest, 0.0)
-        cost += 0.2 * np.maximum(push - 1.0, 0.0)
-        asked = self.solution.asked["apex"]
-        self.miss = np.zeros(count)
-        for i in range(count):
-            flight = thrown.fall(place[i], velocity[i], np.array(RIM))
-            self.miss[i] = flight["miss"] if flight["apex"] > RING_RADIUS else np.inf
-            cost[i] += flight["miss"] + 0.5 * abs(flight["apex"] - asked)
-            cost[i] += 2.0 * (flight["apex"] < RING_RADIUS)
+        return Flight(place.copy(), velocity.copy(), before, lowest)
+
+    def cost(self, flight: Flight) -> np.ndarray:
+        """(N,) how far throws are off: where the ball would come down (m) and how high it goes, a
+        ball that sinks too low or is not free."""
+        step, asked = self.scene.control_timestep, self.solution.asked["apex"]
+        push = (flight.velocity - flight.before) / step + (0.0, 0.0, GRAVITY)
+        cost = 5.0 * np.maximum(LOWEST + 0.02 - flight.lowest, 0.0)
+        cost += 0.2 * np.maximum(np.linalg.norm(push, axis=1) - 1.0, 0.0)
+        self.miss = np.zeros(len(cost))
+        for i, (place, velocity) in enumerate(zip(flight.place, flight.velocity)):
+            found = thrown.fall(place, velocity, np.array(RIM))
+            self.miss[i] = found["miss"] if found["apex"] > RING_RADIUS else np.inf
+            cost[i] += found["miss"] + 0.5 * abs(found["apex"] - asked)
+            cost[i] += 2.0 * (found["apex"] < RING_RADIUS)
         return np.nan_to_num(cost, nan=1e6, posinf=1e6)
+
+    def judge(self, numbers: np.ndarray) -> np.ndarray:
+        """(N,) cost of candidates (N, P): how far their throws are off and the size of the
+        changes."""
+        ctrl = np.stack([self.targets(row, self.steps) for row in numbers])
+        return self.cost(self.fly(self.worlds, ctrl)) + changed(numbers)
+
+
+def changed(numbers: np.ndarray) -> np.ndarray:
+    """(N,) cost of the parameters (N, P), in their units, for their size."""
+    return 0.01 * (numbers**2).sum(1)
 
 
 def refine(
@@ -149,7 +182,7 @@ def refine(
     the task calls it a basket or not. Raises RuntimeError when the simulation diverges.
     """
     settings = settings or Search()
-    thrower = _Thrower(solution, settings.worlds, threads)
+    thrower = Thrower(solution, settings.worlds, threads)
     search = CrossEntropy(len(UNITS), settings.worlds, settings.seed)
     miss, tried = np.inf, None
     found: Refined | None = None
@@ -180,7 +213,7 @@ def _rank(found: Refined) -> tuple[bool, float]:
     return found.success, -_off(found)
 
 
-def throw(solution: Solution, thrower: _Thrower, numbers: np.ndarray) -> Clip:
+def throw(solution: Solution, thrower: Thrower, numbers: np.ndarray) -> Clip:
     """The throw of the parameters (P,), played in the task with the ball until it ends."""
     strength = solution.body.strength
     steps = math.ceil(solution.duration / thrower.scene.control_timestep)

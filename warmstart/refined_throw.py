@@ -2,11 +2,12 @@
 
 What is certified of a free throw is its plan, with the ball rigid on a hand. The clip beside the
 certificate is another motion: :mod:`warmstart.refine` changed the plan's targets until MuJoCo's
-task counted a basket. So the clip is played again with the real ball, from the task's own start and
-by the task's own rules, in MuJoCo and in Drake. The ball's release is compared with the shot that
-was asked for: the one from where the ball is let go that rises to the asked apex and falls through
-the middle of the ring. The clip is called certified only where its plan is, and speed and direction
-keep the gate's limits for a throw in both engines.
+task counted a basket, or :mod:`warmstart.robust_throw` for both engines. So the clip is played
+again with the real ball, from the task's own start and by the task's own rules, in MuJoCo and in
+Drake. The ball's release is compared with the shot that was asked for: the one from where the ball
+is let go that rises to the asked apex and falls through the middle of the ring. The clip is called
+certified only where its plan is, and speed and direction keep the gate's limits for a throw in both
+engines. What noise on its targets does to it is recorded beside that.
 
 ``python -m warmstart.refined_throw warmstart/data/free_throw_*.npz`` measures clips and writes what
 it finds into them and into their certificates.
@@ -34,8 +35,11 @@ from warmstart.performance import perform
 
 TASK = "free_throw"
 MOTION = "refined in MuJoCo from a certified throw"
-"""What such a clip is, in its own ``meta`` and in ``list``."""
+"""What a clip is, in its own ``meta`` and in ``list``, that does not say so itself."""
 ENGINES = ("mujoco", "drake")
+NOISE, THROWS = 1e-3, 8
+"""Standard deviation of what is added to every target of every control step (rad), and how often,
+to see whether a throw is one by luck."""
 
 
 def limits() -> dict[str, float]:
@@ -87,6 +91,26 @@ def measure(clip: Clip, engine: str) -> dict[str, float]:
     return {name: round(value, 4) for name, value in found.items()}
 
 
+def perturbed(clip: Clip, engine: str) -> dict[str, float]:
+    """What noise on its targets makes of a clip's throw in an engine: of ``THROWS`` throws how many
+    keep the gate's limits (``kept``) and how many are ``baskets``; the largest ``speed_off`` and
+    ``direction_off`` (deg) of those in which the ball is thrown at all."""
+    generator, limit = np.random.default_rng(0), limits()
+    out = dict.fromkeys(("kept", "baskets", *limit), 0.0)
+    if clip.ctrl is None:
+        return out
+    for _ in range(THROWS):
+        noise = NOISE * generator.standard_normal(clip.ctrl.shape)
+        try:
+            found = measure(replace(clip, ctrl=clip.ctrl + noise), engine)
+        except (RuntimeError, ValueError):
+            continue
+        out["kept"] += all(found[name] <= limit[name] for name in limit)
+        out["baskets"] += found["basket"] == 1.0
+        out |= {name: max(out[name], found[name]) for name in limit}
+    return out
+
+
 def elevation(velocity: np.ndarray) -> float:
     """Angle of a velocity (3,) above the horizontal (deg)."""
     return float(np.degrees(np.arctan2(velocity[2], np.hypot(velocity[0], velocity[1]))))
@@ -95,13 +119,17 @@ def elevation(velocity: np.ndarray) -> float:
 def record(clip: Clip, certificate: Certificate) -> dict[str, Any]:
     """What a certificate says of the clip beside it: what motion it is, the plan's release, its
     own throw in each engine (:func:`measure`; a sentence under ``failed`` where there was none),
-    the limits, whether it is certified and, where it is not, why not."""
-    out: dict[str, Any] = {"motion": MOTION, "planned": planned(certificate), "limits": limits()}
+    the limits, whether it is certified and, where it is not, why not. ``perturbed`` says what noise
+    does to it in each engine (:func:`perturbed`); that is recorded and no limit."""
+    motion = clip.meta.get("motion", MOTION)
+    out: dict[str, Any] = {"motion": motion, "planned": planned(certificate), "limits": limits()}
     for engine in ENGINES:
         try:
             out[engine] = measure(clip, engine)
         except (RuntimeError, ValueError) as error:
             out[engine] = {"failed": str(error)}
+    shaken: dict[str, Any] = {"noise": NOISE, "throws": THROWS}
+    out["perturbed"] = shaken | {engine: perturbed(clip, engine) for engine in ENGINES}
     reasons = breaches(out, certificate)
     return out | {"certified": not reasons, "why_not": "; ".join(reasons)}
 

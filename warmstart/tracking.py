@@ -112,7 +112,7 @@ class Worlds:
         for sensor in list(spec.sensors):  # nobody reads other forces here, and they cost time
             if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT and sensor.name not in ground:
                 spec.delete(sensor)
-        self.scene, self.model, self._root = scene, spec.compile(), root
+        self.scene, self.model, self._root = scene, self._compiled(spec), root
         self.batch = Batch(self.model, nsim=worlds, nthread=threads)
         bind = self.batch.bind
         self.qpos, self.qvel, self.ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
@@ -144,9 +144,17 @@ class Worlds:
         self.touched = np.zeros((len(self.ids), len(self._ground)), dtype=bool)
         for substep in range(self.scene.substeps):
             last = substep == self.scene.substeps - 1
-            self.batch.step(ids=self.ids, stage=_VEL if last else 0)
+            self._substep(_VEL if last else 0)
             self.touched |= self._sensors[: len(self.ids), self._ground].any(2)
             _, self._shift = self.keeper.correct(current=last)
+
+    def _compiled(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
+        """The model of all worlds; worlds of another kind change it here."""
+        return spec.compile()
+
+    def _substep(self, stage: int) -> None:
+        """One time step of the worlds that were put, up to a stage of MuJoCo's."""
+        self.batch.step(ids=self.ids, stage=stage)
 
     @property
     def link_pos(self) -> np.ndarray:

@@ -166,10 +166,10 @@ def test_list_as_json(capsys):
     for policy in found["pretrained"]:
         assert Path(policy["path"]).is_file()
     thrown = {d["name"]: d for d in found["demonstrations"]}["free_throw_1.2m_human"]
-    assert thrown["motion"] == "refined in MuJoCo from a certified throw"
+    assert thrown["motion"] == "refined in MuJoCo and Drake from a certified throw"
     assert thrown["plan_certified"] is True
-    assert thrown["certified"] is thrown["throw"]["certified"] is False
-    assert thrown["throw"]["mujoco"]["basket"] == 1.0 and thrown["throw"]["drake"]["basket"] == 0.0
+    assert thrown["certified"] is thrown["throw"]["certified"] is True
+    assert thrown["throw"]["mujoco"]["basket"] == thrown["throw"]["drake"]["basket"] == 1.0
 
 
 def test_a_refined_throw_is_told_apart_in_the_table(capsys, monkeypatch):
@@ -177,14 +177,16 @@ def test_a_refined_throw_is_told_apart_in_the_table(capsys, monkeypatch):
 
     monkeypatch.setenv("COLUMNS", "400")
     rows = catalogue.catalogue()["demonstrations"]
+    one, other = (row for row in rows if row["throw"])
+    one["throw"]["why_not"] = "it was pushed"
     monkeypatch.setattr(catalogue, "catalogue", lambda: {"demonstrations": rows})
     assert cli.main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     text = " ".join(" ".join(lines).split())
-    for row in rows:
-        if row["throw"]:
-            assert f"Not certified: {row['throw']['why_not']}" in text
-    assert text.count("refined in MuJoCo from a certified throw") == 2
+    assert text.count("Not certified:") == text.count("Not certified: it was pushed") == 1
+    for throw in (one["throw"], other["throw"]):
+        assert f"drake: {throw['drake']['release_speed']:.2f} m/s" in text
+    assert text.count("refined in MuJoCo and Drake from a certified throw") == 2
 
 
 SCHEMA = {

@@ -12,7 +12,9 @@ import pytest
 
 from olympics_opt.cli import main
 from olympics_opt.previews import write_previews
+from olympics_opt.report.page import Text
 from olympics_opt.report.replay import ReplayTrack
+from olympics_opt.report.sections import certificate_section
 from warmstart.bank import demonstration_files
 from warmstart.clip import Clip
 from warmstart.replay import scene_of
@@ -30,7 +32,11 @@ def test_every_demonstration_has_a_page_with_its_checks(tmp_path: Path, capsys) 
             assert check["name"] in page, (path.stem, check["name"])
         assert ("this motion is a demonstration" in page) == ("clip" not in facts)
         if "clip" in facts:
-            assert f"not certified, {facts['clip']['why_not']}" in page
+            assert ("it is certified too." in page) is facts["clip"]["certified"]
+            pushed = facts["clip"] | {"certified": False, "why_not": "it was pushed"}
+            verdict = certificate_section(facts | {"clip": pushed}).blocks[0]
+            assert isinstance(verdict, Text)
+            assert verdict.text.endswith("not certified, it was pushed.")
 
 
 def test_a_thrown_ball_is_in_the_replay() -> None:
