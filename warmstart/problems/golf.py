@@ -161,7 +161,7 @@ def transcribe(
     program.ground(corners, np.arange(program.K), MARGIN)
     shape(program, event)
     hands_together(program, body)
-    both_feet(program, SPREAD / config.detail)
+    striker.both_feet(program, BOTH, SPREAD / config.detail)
     return program
 
 
@@ -227,19 +227,6 @@ def hands_together(program: Transcription, body: Body) -> None:
         return [("hands together", ca.sumsqr(a - b) / 0.05, low**2 / 0.05, high**2 / 0.05)]
 
     program.rows("hands", np.arange(program.K), beside)
-
-
-def both_feet(program: Transcription, price: float) -> None:
-    """Each foot carries its share of the weight, and by a ``price`` evenly over its sole."""
-    least = BOTH * program.weight
-    for side, forces in program.f.items():
-        up = np.array([index[:, 2] for index in forces.values()])
-
-        def carried(f, p):
-            rows = [("weight on both feet", ca.sum1(f) / least, 1.0, np.inf)]
-            return price * ca.sumsqr(f / program.weight), rows
-
-        program.program.block(f"load {side}", [up], carried)
 
 
 POSITION = {
