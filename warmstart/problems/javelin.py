@@ -43,7 +43,7 @@ DRAW, SWING, FOLLOW = (0.20, 0.45), (0.16, 0.35), (0.30, 0.50)
 """Durations (s): the slow first part, with long steps; until the release; and after it."""
 DURATIONS = (0.45, 0.25, OPENING, 0.30)
 """Of the phases in a first guess (s)."""
-CLOSING = 3.0
+CLOSING = 4.0
 """How many times shorter the last step before the release is: the wrist works fast there."""
 TILT = math.radians(35.0)
 """How far the held javelin may point from where it will fly."""
@@ -53,14 +53,18 @@ CORNERS = 0.03
 """How far the corners of the left hand stick out of its ball (m)."""
 STRAIGHT = 170.0
 """How much the javelin may be accelerated across its way at the release (m/s^2)."""
+STANCE = ((0.15, 0.6), (0.4, 0.9))
+"""How far the left foot stands to the left of and ahead of the right one (m)."""
 FRICTION = {"friction_x": 0.4, "friction_y": 0.3}
 """Shares of its load that a sole point may push with along the ground."""
 BOTH = 0.1
 """Share of body weight that each foot carries at least."""
 SPREAD = 0.02
 """Cost at one knot of the squared load of a sole point over body weight."""
-EASY = 0.85
+EASY = 0.8
 """Share of its torque limit that the wrist may use: it needs more between two knots."""
+DROP = 225.0
+"""How much the force that the javelin needs may change while the hand opens (N)."""
 JERK = 6.0
 """How much the moment that it needs at the wrist may change while the hand opens (N m)."""
 SPIN = 1.0
@@ -115,7 +119,7 @@ def transcribe(
     knots = jumper.scaled(config.detail)
     phases = [
         Phase("draw", knots(14), DRAW, FEET),
-        Phase("swing", knots(24), SWING, FEET, closing=CLOSING),
+        Phase("swing", knots(26), SWING, FEET, closing=CLOSING),
         Phase("release", 1, (OPENING, OPENING), FEET, abrupt=True),
         Phase("follow", knots(14), FOLLOW, FEET, grading=CLOSING, loaded=False),
     ]
@@ -131,7 +135,7 @@ def transcribe(
         unloaded=bare,
         shear=SHEAR,
         bounds=FRICTION,
-        feet=((0.15, 0.6), (0.2, 0.9)),
+        feet=STANCE,
         elastic=elastic,
     )
     held = np.array([k for k in range(program.K) if program.model_at(k) is program.model])
@@ -169,15 +173,19 @@ def opens(program: Transcription) -> None:
     model, link, middle = program.model, program.model.tree.link(LINK), ca.DM(list(GRIP))
     turning = ca.DM([0.0, MASS * END**2 / 3.0, MASS * END**2 / 3.0])
 
-    def moment(state):
+    def needs(state):
         motion = model.motion(*state)
         w, alpha = motion.w[link], motion.alpha[link]
         own = motion.acc[link] + ca.cross(alpha, middle) + ca.cross(w, ca.cross(w, middle))
-        return MASS * ca.cross(middle, own) + turning * alpha
+        return MASS * own, MASS * ca.cross(middle, own) + turning * alpha
 
     def build(*x):
-        change = moment(x[3:6]) - moment(x[:3])
-        return 0.0, [("opening", change / 20.0, -JERK / 20.0, JERK / 20.0)]
+        (force, moment), (later, twist) = needs(x[:3]), needs(x[3:6])
+        drop = ca.sumsqr(later - force) / DROP**2
+        return 0.0, [
+            ("opening, force", drop, -np.inf, 1.0),
+            ("opening, moment", (twist - moment) / 20.0, -JERK / 20.0, JERK / 20.0),
+        ]
 
     ends = program.knots("release")
     states = [x[[k]] for k in ends for x in (program.q, program.v, program.a)]
@@ -186,7 +194,7 @@ def opens(program: Transcription) -> None:
 
 FREE = (*striker.FREE, *GIRDLE)
 HELD_LIMITS = (
-    *("L_Thorax_x", "L_Thorax_y", "L_Thorax_z"),
+    *("L_Thorax_x", "L_Thorax_y", "L_Thorax_z", "L_Elbow_x", "Neck_x", "Neck_y", "Head_y"),
     "R_Elbow_x",
     *striker.HELD_LIMITS[7:],
 )
