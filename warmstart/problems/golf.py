@@ -40,8 +40,10 @@ MARGIN = 0.008
 BEHIND = (0.06, 0.15)
 """How far behind its place at the impact the face is at address (m)."""
 FEET = {"L": "flat", "R": "flat"}
-BACK, SWING, FOLLOW = (0.40, 0.65), (0.22, 0.40), (0.45, 0.75)
+BACK, SWING, FOLLOW = (0.40, 0.75), (0.20, 0.36), (0.45, 0.75)
 """Durations (s) of the phases."""
+CLOSING = 3.0
+"""How many times shorter the steps next to the impact are."""
 DURATIONS = (0.65, 0.35, 0.50)
 """The same of a first guess."""
 GAP = (0.03, 0.06)
@@ -70,6 +72,14 @@ STANCE = ((0.45, 0.65), (-0.05, 0.05))
 """How far the left foot stands to the left of and ahead of the right one (m)."""
 FLARE = {"L": (-0.1, 0.4), "R": (-0.4, 0.1)}
 """Sine of the angle by which a foot points to the left of straight ahead."""
+WAIST = 0.02
+"""How far the right forearm keeps off pelvis and waist (m)."""
+SHARE = 0.87
+"""Share of a torque limit that may be used at knots: a grip is at its limit there, and needs more
+between two."""
+PLANE = 0.78
+"""The club stays where height and distance ahead of the middle between the feet add up to more (m):
+thighs and knees do not."""
 BOTH = 0.3
 """Share of body weight that each foot carries at least: who stands on one topples in a replay."""
 SPREAD = 0.02
@@ -139,18 +149,21 @@ def transcribe(
     """The nonlinear program."""
     knots = jumper.scaled(config.detail)
     phases = [
-        Phase("back", knots(12), BACK, FEET),
-        Phase("swing", knots(18), SWING, FEET),
-        Phase("follow", knots(11), FOLLOW, FEET),
+        Phase("back", knots(18), BACK, FEET, closing=CLOSING),
+        Phase("swing", knots(24), SWING, FEET, closing=CLOSING),
+        Phase("follow", knots(13), FOLLOW, FEET, grading=CLOSING),
     ]
     program = striker.transcribe(
         body,
         event,
         phases,
         config,
+        free=FREE,
         position=POSITION,
+        held_limits=HELD_LIMITS,
         tool=club(body),
         feet=STANCE,
+        bounds={"torque_share": SHARE},
         shear=SHEAR,
         comfort=COMFORT,
         elastic=elastic,
@@ -159,6 +172,12 @@ def transcribe(
         Ball(LINK, (float(x), float(y), float(z)), 0.0) for x, y, z in tee_shot.head_corners(body)
     ]
     program.ground(corners, np.arange(program.K), MARGIN)
+    before_the_legs(program, body)
+    pelvis = [replace(b, radius=b.radius + CORNERS) for b in axis_balls(body, "Pelvis")]
+    arm = [*axis_balls(body, "R_Elbow", 3), *axis_balls(body, "R_Wrist")]
+    waist = [*pelvis, *axis_balls(body, "Torso"), *axis_balls(body, "Spine")]
+    pairs = [(a, b) for a in arm for b in waist]
+    clearance.keep_off(program, pairs, np.arange(program.K), WAIST)
     shape(program, event)
     hands_together(program, body)
     striker.both_feet(program, BOTH, SPREAD / config.detail)
@@ -211,6 +230,20 @@ def shape(program: Transcription, event: striker.Event) -> None:
         program.bound(program.q[-1, model.index(name)], low, high)
 
 
+def before_the_legs(program: Transcription, body: Body) -> None:
+    """Shaft and head stay before a plane that rises backwards over the legs: a distance has no
+    sign, and the club might pass through a leg between two knots."""
+    model, balls = program.model, club(body)
+
+    def before(q, p):
+        motion = model.motion(q)
+        points = [motion.point(model.tree.link(b.link), b.center) for b in balls]
+        gaps = [point[0] + point[2] - PLANE - b.radius for point, b in zip(points, balls)]
+        return [("before the legs", ca.vertcat(*gaps) / 0.1, 0.0, np.inf)]
+
+    program.rows("before the legs", np.arange(program.K), before)
+
+
 def hands_together(program: Transcription, body: Body) -> None:
     """The left hand stays beside the right one, as in a grip, without touching the right arm."""
     model = program.model
@@ -229,7 +262,15 @@ def hands_together(program: Transcription, body: Body) -> None:
     program.rows("hands", np.arange(program.K), beside)
 
 
+GIRDLE = ("R_Thorax_x", "R_Thorax_y", "R_Thorax_z")
+FREE = (*striker.FREE, *GIRDLE)
+"""The shoulder girdle of the arm that swings moves too."""
+HELD_LIMITS = (
+    *("L_Thorax_x", "L_Thorax_y", "L_Thorax_z", "Neck_x", "Neck_y", "Head_y"),
+    *striker.HELD_LIMITS[3:],
+)
 POSITION = {
+    **dict.fromkeys(GIRDLE, (-0.4, 0.4)),
     "R_Shoulder_z": (-0.9, 2.1),
     "R_Elbow_z": (0.05, 2.4),
     "R_Elbow_y": (-1.5, 1.5),
