@@ -35,16 +35,16 @@ AHEAD = golf.PLAYER_Y
 """How far before the middle between the feet the ball lies (m)."""
 YAW = -math.pi / 2
 """The athlete faces -y; play is along +x, to its left."""
-MARGIN = 0.012
+MARGIN = 0.008
 """What the head keeps off the ground at knots (m)."""
 BEHIND = (0.06, 0.15)
 """How far behind its place at the impact the face is at address (m)."""
 FEET = {"L": "flat", "R": "flat"}
-BACK, SWING, FOLLOW = (0.40, 0.66), (0.20, 0.33), (0.45, 0.75)
+BACK, SWING, FOLLOW = (0.40, 0.75), (0.20, 0.36), (0.45, 0.75)
 """Durations (s) of the phases."""
 CLOSING = 3.0
 """How many times shorter the steps next to the impact are."""
-DURATIONS = (0.60, 0.32, 0.50)
+DURATIONS = (0.75, 0.36, 0.45)
 """The same of a first guess."""
 GAP = (0.03, 0.06)
 """Between the ball of the left hand and the right one (m)."""
@@ -73,8 +73,8 @@ STANCE = ((0.45, 0.65), (-0.05, 0.05))
 FLARE = {"L": (-0.1, 0.4), "R": (-0.4, 0.1)}
 """Sine of the angle by which a foot points to the left of straight ahead."""
 WAIST = 0.02
-"""How far the right forearm keeps off pelvis and waist, both off the head (m)."""
-SHARE = 0.9
+"""How far the right forearm keeps off pelvis and waist (m)."""
+SHARE = 0.87
 """Share of a torque limit that may be used at knots: a grip is at its limit there, and needs more
 between two."""
 PLANE = 0.78
@@ -85,7 +85,7 @@ BOTH = 0.3
 SPREAD = 0.02
 """Cost at one knot of the squared load of a sole point over body weight: a plan that stands on the
 edge of a sole rolls over it in an engine, whose ground is soft."""
-SHEAR = 5000.0
+SHEAR = 2000.0
 """Weight of horizontal force on the feet."""
 LOFTS = (0.0, 14.0)
 """Degrees. The head is a box 0.1 m deep: more tilted, it would dig in under a ball 5 cm up."""
@@ -149,8 +149,8 @@ def transcribe(
     """The nonlinear program."""
     knots = jumper.scaled(config.detail)
     phases = [
-        Phase("back", knots(20), BACK, FEET, closing=2.0),
-        Phase("swing", knots(26), SWING, FEET, closing=CLOSING),
+        Phase("back", knots(18), BACK, FEET, closing=CLOSING),
+        Phase("swing", knots(24), SWING, FEET, closing=CLOSING),
         Phase("follow", knots(13), FOLLOW, FEET, grading=CLOSING),
     ]
     program = striker.transcribe(
@@ -177,8 +177,6 @@ def transcribe(
     arm = [*axis_balls(body, "R_Elbow", 3), *axis_balls(body, "R_Wrist")]
     waist = [*pelvis, *axis_balls(body, "Torso"), *axis_balls(body, "Spine")]
     pairs = [(a, b) for a in arm for b in waist]
-    head = [replace(b, radius=b.radius + CORNERS) for b in axis_balls(body, "Head")]
-    pairs += [(a, b) for s in "LR" for a in axis_balls(body, f"{s}_Elbow", 3) for b in head]
     clearance.keep_off(program, pairs, np.arange(program.K), WAIST)
     shape(program, event)
     hands_together(program, body)
