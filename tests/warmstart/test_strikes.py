@@ -337,16 +337,13 @@ def test_no_limb_passes_through_the_javelin_between_two_knots(fast_throw):
         assert not any(hand in pair and 0 not in pair for pair in met)
 
 
-def test_the_hand_opens_without_a_jerk_at_the_wrist(fast_throw):
-    """The torque of the wrist between the two knots of the opening, by Drake, stays near the
-    straight line between theirs: it is as good as what the servos are given."""
+def test_the_wrist_stays_within_its_limit_while_the_hand_opens(fast_throw):
+    """By Drake, at 21 moments between the two knots, where the mass changes with the motion."""
     payload, body = fast_throw.stats["payload"], fast_throw.body
-    times = np.linspace(payload["held"], payload["gone"], 9)
-    share = ((times - times[0]) / (times[-1] - times[0]))[:, None]
-    wrist = [6 + body.dof_index(f"R_Wrist_{axis}") for axis in "xyz"]
-    torque = needed(inverse_dynamics_drake, fast_throw, times)[:, wrist]
-    line = (1.0 - share) * torque[0] + share * torque[-1]
-    assert np.abs(torque - line).max() < 0.15 * body.array("effort")[wrist[0] - 6]
+    times = np.linspace(payload["held"], payload["gone"], 21)
+    wrist = [body.dof_index(f"R_Wrist_{axis}") for axis in "xyz"]
+    torque = needed(inverse_dynamics_drake, fast_throw, times)[:, 6:][:, wrist]
+    assert (np.abs(torque) / body.array("effort")[wrist]).max() < 1.02
 
 
 def test_steps_shrink_before_an_event_as_they_grow_after_one():
