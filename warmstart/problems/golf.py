@@ -44,8 +44,10 @@ BACK, SWING, FOLLOW = (0.40, 0.75), (0.20, 0.36), (0.45, 0.75)
 """Durations (s) of the phases."""
 CLOSING = 3.0
 """How many times shorter the steps next to the impact are."""
-DURATIONS = (0.75, 0.36, 0.45)
-"""The same of a first guess."""
+DURATIONS = {"golf": (0.65, 0.35, 0.50), "golf_swing": (0.75, 0.36, 0.45)}
+"""The same of a first guess, by its key poses."""
+FAST = 14.0
+"""A stroke above this speed (m/s) starts from the key poses of a full swing."""
 GAP = (0.03, 0.06)
 """Between the ball of the left hand and the right one (m)."""
 CORNERS = 0.025
@@ -296,12 +298,13 @@ def solve(
     """The least-effort stroke. See :meth:`warmstart.problems.Problem.solve`."""
     body = load_body("smpl", strength=config.strength, equipment=["club"])
     event = make_event(config, body)
+    keys = "golf_swing" if config.club_speed > FAST else "golf"
     return striker.solve(
         "golf",
         {"club_speed": config.club_speed},
         event,
         lambda elastic: transcribe(config, body, event, elastic),
-        lambda program: striker.key_guess(program, "golf", DURATIONS),
+        lambda program: striker.key_guess(program, keys, DURATIONS[keys]),
         guess,
         config,
         progress,
