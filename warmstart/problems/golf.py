@@ -40,14 +40,62 @@ MARGIN = 0.008
 BEHIND = (0.06, 0.15)
 """How far behind its place at the impact the face is at address (m)."""
 FEET = {"L": "flat", "R": "flat"}
-BACK, SWING, FOLLOW = (0.40, 0.75), (0.20, 0.36), (0.45, 0.75)
-"""Durations (s) of the phases."""
+GIRDLE = ("R_Thorax_x", "R_Thorax_y", "R_Thorax_z")
 CLOSING = 3.0
-"""How many times shorter the steps next to the impact are."""
-DURATIONS = {"golf": (0.65, 0.35, 0.50), "golf_swing": (0.75, 0.36, 0.45)}
-"""The same of a first guess, by its key poses."""
-FAST = 14.0
-"""A stroke above this speed (m/s) starts from the key poses of a full swing."""
+"""How many times shorter the steps next to the impact of a full swing are."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What differs between a chip and a full swing."""
+
+    keys: str
+    """Name of its key poses."""
+    intervals: tuple[int, int, int]
+    durations: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+    """Of the phases back, swing and follow (s)."""
+    guess: tuple[float, float, float]
+    """The same of a first guess."""
+    free: tuple[str, ...]
+    held_limits: tuple[str, ...]
+    closing: float
+    """How many times shorter the steps next to the impact are."""
+    share: float
+    """Share of a torque limit that may be used at knots: in a full swing the grip is at its limit
+    there, and needs more between two."""
+    full: bool
+    """Whether rows keep the club before the legs, and the arm off the waist."""
+
+
+CHIP = Kind(
+    keys="golf",
+    intervals=(12, 18, 11),
+    durations=((0.40, 0.65), (0.22, 0.40), (0.45, 0.75)),
+    guess=(0.65, 0.35, 0.50),
+    free=striker.FREE,
+    held_limits=striker.HELD_LIMITS,
+    closing=1.0,
+    share=striker.SHARE,
+    full=False,
+)
+SWING = Kind(
+    keys="golf_swing",
+    intervals=(18, 24, 13),
+    durations=((0.40, 0.75), (0.20, 0.36), (0.45, 0.75)),
+    guess=(0.75, 0.36, 0.45),
+    free=(*striker.FREE, *GIRDLE),
+    held_limits=(
+        *("L_Thorax_x", "L_Thorax_y", "L_Thorax_z", "Neck_x", "Neck_y", "Head_y"),
+        *striker.HELD_LIMITS[3:],
+    ),
+    closing=CLOSING,
+    share=0.87,
+    full=True,
+)
+FAST = 15.0
+"""A stroke above this speed (m/s) is a full swing, in which the shoulder girdle moves too."""
+
+
 GAP = (0.03, 0.06)
 """Between the ball of the left hand and the right one (m)."""
 CORNERS = 0.025
@@ -76,9 +124,6 @@ FLARE = {"L": (-0.1, 0.4), "R": (-0.4, 0.1)}
 """Sine of the angle by which a foot points to the left of straight ahead."""
 WAIST = 0.02
 """How far the right forearm keeps off pelvis and waist (m)."""
-SHARE = 0.87
-"""Share of a torque limit that may be used at knots: a grip is at its limit there, and needs more
-between two."""
 PLANE = 0.78
 """The club stays where height and distance ahead of the middle between the feet add up to more (m):
 thighs and knees do not."""
@@ -120,6 +165,11 @@ class Config(striker.Config):
             raise ValueError(f"attack must lie between -5 and 15 degrees, not {self.attack}")
 
 
+def kind_of(config: Config) -> Kind:
+    """Chip or full swing, by the asked speed."""
+    return SWING if config.club_speed > FAST else CHIP
+
+
 def club(body: Body) -> list[Ball]:
     """Balls around shaft and head, for clearances."""
     shaft, head = body.links[body.link_index(LINK)].shapes
@@ -150,22 +200,25 @@ def transcribe(
 ) -> Transcription:
     """The nonlinear program."""
     knots = jumper.scaled(config.detail)
+    kind = kind_of(config)
+    back, swing, follow = kind.durations
+    counts = [knots(n) for n in kind.intervals]
     phases = [
-        Phase("back", knots(18), BACK, FEET, closing=CLOSING),
-        Phase("swing", knots(24), SWING, FEET, closing=CLOSING),
-        Phase("follow", knots(13), FOLLOW, FEET, grading=CLOSING),
+        Phase("back", counts[0], back, FEET, closing=kind.closing),
+        Phase("swing", counts[1], swing, FEET, closing=kind.closing),
+        Phase("follow", counts[2], follow, FEET, grading=kind.closing),
     ]
     program = striker.transcribe(
         body,
         event,
         phases,
         config,
-        free=FREE,
+        free=kind.free,
         position=POSITION,
-        held_limits=HELD_LIMITS,
+        held_limits=kind.held_limits,
         tool=club(body),
         feet=STANCE,
-        bounds={"torque_share": SHARE},
+        bounds={"torque_share": kind.share},
         shear=SHEAR,
         comfort=COMFORT,
         elastic=elastic,
@@ -174,12 +227,9 @@ def transcribe(
         Ball(LINK, (float(x), float(y), float(z)), 0.0) for x, y, z in tee_shot.head_corners(body)
     ]
     program.ground(corners, np.arange(program.K), MARGIN)
-    before_the_legs(program, body)
-    pelvis = [replace(b, radius=b.radius + CORNERS) for b in axis_balls(body, "Pelvis")]
-    arm = [*axis_balls(body, "R_Elbow", 3), *axis_balls(body, "R_Wrist")]
-    waist = [*pelvis, *axis_balls(body, "Torso"), *axis_balls(body, "Spine")]
-    pairs = [(a, b) for a in arm for b in waist]
-    clearance.keep_off(program, pairs, np.arange(program.K), WAIST)
+    if kind.full:
+        before_the_legs(program, body)
+        off_the_waist(program, body)
     shape(program, event)
     hands_together(program, body)
     striker.both_feet(program, BOTH, SPREAD / config.detail)
@@ -246,6 +296,15 @@ def before_the_legs(program: Transcription, body: Body) -> None:
     program.rows("before the legs", np.arange(program.K), before)
 
 
+def off_the_waist(program: Transcription, body: Body) -> None:
+    """The right forearm keeps off pelvis and waist."""
+    pelvis = [replace(b, radius=b.radius + CORNERS) for b in axis_balls(body, "Pelvis")]
+    arm = [*axis_balls(body, "R_Elbow", 3), *axis_balls(body, "R_Wrist")]
+    waist = [*pelvis, *axis_balls(body, "Torso"), *axis_balls(body, "Spine")]
+    pairs = [(a, b) for a in arm for b in waist]
+    clearance.keep_off(program, pairs, np.arange(program.K), WAIST)
+
+
 def hands_together(program: Transcription, body: Body) -> None:
     """The left hand stays beside the right one, as in a grip, without touching the right arm."""
     model = program.model
@@ -264,13 +323,6 @@ def hands_together(program: Transcription, body: Body) -> None:
     program.rows("hands", np.arange(program.K), beside)
 
 
-GIRDLE = ("R_Thorax_x", "R_Thorax_y", "R_Thorax_z")
-FREE = (*striker.FREE, *GIRDLE)
-"""The shoulder girdle of the arm that swings moves too."""
-HELD_LIMITS = (
-    *("L_Thorax_x", "L_Thorax_y", "L_Thorax_z", "Neck_x", "Neck_y", "Head_y"),
-    *striker.HELD_LIMITS[3:],
-)
 POSITION = {
     **dict.fromkeys(GIRDLE, (-0.4, 0.4)),
     "R_Shoulder_z": (-0.9, 2.1),
@@ -298,13 +350,13 @@ def solve(
     """The least-effort stroke. See :meth:`warmstart.problems.Problem.solve`."""
     body = load_body("smpl", strength=config.strength, equipment=["club"])
     event = make_event(config, body)
-    keys = "golf_swing" if config.club_speed > FAST else "golf"
+    kind = kind_of(config)
     return striker.solve(
         "golf",
         {"club_speed": config.club_speed},
         event,
         lambda elastic: transcribe(config, body, event, elastic),
-        lambda program: striker.key_guess(program, keys, DURATIONS[keys]),
+        lambda program: striker.key_guess(program, kind.keys, kind.guess),
         guess,
         config,
         progress,
