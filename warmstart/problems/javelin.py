@@ -121,7 +121,7 @@ def transcribe(
         Phase("draw", knots(14), DRAW, FEET),
         Phase("swing", knots(26), SWING, FEET, closing=CLOSING),
         Phase("release", 1, (OPENING, OPENING), FEET, abrupt=True),
-        Phase("follow", knots(14), FOLLOW, FEET, grading=CLOSING, loaded=False),
+        Phase("follow", knots(18), FOLLOW, FEET, grading=CLOSING, loaded=False),
     ]
     program = striker.transcribe(
         body,
