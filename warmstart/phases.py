@@ -27,15 +27,19 @@ class Phase:
     """Contact mode by side, e.g. ``{"L": "flat"}``; modes: ``flat``, ``toe``."""
     grading: float = 1.0
     """Length of the later intervals over the first: small steps where motion is abrupt."""
+    closing: float = 1.0
+    """Length of the earlier intervals over the last: small steps before a blow."""
     loaded: bool = True
     """Whether what the athlete holds is still in its hand."""
     abrupt: bool = False
     """A moment in which torques, forces and accelerations may change at no cost: a hand opens."""
 
     def spacing(self) -> np.ndarray:
-        """(intervals,) lengths relative to their mean: growing over the first third, then equal."""
+        """(intervals,) lengths relative to their mean: growing over the first third, shrinking over
+        the last one, else equal."""
         i = np.arange(self.intervals) / max(self.intervals / 3, 1)
         w = np.minimum(1 / self.grading + (1 - 1 / self.grading) * i, 1.0)
+        w = np.minimum(w, (1 / self.closing + (1 - 1 / self.closing) * i)[::-1])
         return w / w.mean()
 
 

@@ -90,7 +90,7 @@ PROBLEMS: dict[str, Problem] = {
             summary="throw from a stand at a given release speed, angle and height",
             outcome="release_speed",
             unit="m/s",
-            sweep=(10.0, 12.0, 14.0),
+            sweep=(10.0, 12.0, 14.0, 16.0, 18.0),
             module="warmstart.problems.javelin",
         ),
         Problem(
@@ -98,7 +98,7 @@ PROBLEMS: dict[str, Problem] = {
             summary="stroke off the tee, from chip to swing, at a given club-head speed and loft",
             outcome="club_speed",
             unit="m/s",
-            sweep=(6.0, 9.0, 12.0),
+            sweep=(6.0, 9.0, 12.0, 15.0),
             module="warmstart.problems.golf",
         ),
         Problem(

@@ -74,6 +74,31 @@ def shaft_off(
     program.rows("shaft off", knots, off)
 
 
+def beside_shaft(
+    program: Transcription, event: Event, balls: Sequence[Ball], radius: float, knots
+) -> None:
+    """Balls stay to the left of that shaft or below it, on one side of the plane through it that
+    rises to the left: a distance has no sign, and a limb might pass through between two knots."""
+    model = program.model
+    link = model.tree.link(event.link)
+
+    def beside(q, p):
+        motion = model.motion(q)
+        along = motion.R_WL[link] @ ca.DM(list(event.axis))
+        through = motion.point(link, event.point)
+        up = ca.DM([0.0, 0.0, 1.0]) - along[2] * along
+        left = ca.cross(up, along)  # as long as ``up``
+        side = (left - up) / ca.sqrt(ca.sumsqr(left) + ca.sumsqr(up) + 1e-9)
+        gaps = [
+            ca.dot(motion.point(model.tree.link(b.link), b.center) - through, side)
+            - (b.radius + radius + TOOL_ROOM)
+            for b in balls
+        ]
+        return [("beside the shaft", ca.vertcat(*gaps) / 0.1, 0.0, np.inf)]
+
+    program.rows("beside the shaft", knots, beside)
+
+
 def arms_off(program: Transcription, body: Body, knots) -> None:
     """Arms stay off trunk, head and each other; knees off each other."""
     arms = {s: _forearm(body, s) for s in "LR"}

@@ -40,10 +40,62 @@ MARGIN = 0.008
 BEHIND = (0.06, 0.15)
 """How far behind its place at the impact the face is at address (m)."""
 FEET = {"L": "flat", "R": "flat"}
-BACK, SWING, FOLLOW = (0.40, 0.65), (0.22, 0.40), (0.45, 0.75)
-"""Durations (s) of the phases."""
-DURATIONS = (0.65, 0.35, 0.50)
-"""The same of a first guess."""
+GIRDLE = ("R_Thorax_x", "R_Thorax_y", "R_Thorax_z")
+CLOSING = 3.0
+"""How many times shorter the steps next to the impact of a full swing are."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What differs between a chip and a full swing."""
+
+    keys: str
+    """Name of its key poses."""
+    intervals: tuple[int, int, int]
+    durations: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+    """Of the phases back, swing and follow (s)."""
+    guess: tuple[float, float, float]
+    """The same of a first guess."""
+    free: tuple[str, ...]
+    held_limits: tuple[str, ...]
+    closing: float
+    """How many times shorter the steps next to the impact are."""
+    share: float
+    """Share of a torque limit that may be used at knots: in a full swing the grip is at its limit
+    there, and needs more between two."""
+    full: bool
+    """Whether rows keep the club before the legs, and the arm off the waist."""
+
+
+CHIP = Kind(
+    keys="golf",
+    intervals=(12, 18, 11),
+    durations=((0.40, 0.65), (0.22, 0.40), (0.45, 0.75)),
+    guess=(0.65, 0.35, 0.50),
+    free=striker.FREE,
+    held_limits=striker.HELD_LIMITS,
+    closing=1.0,
+    share=striker.SHARE,
+    full=False,
+)
+SWING = Kind(
+    keys="golf_swing",
+    intervals=(18, 24, 13),
+    durations=((0.40, 0.75), (0.20, 0.36), (0.45, 0.75)),
+    guess=(0.75, 0.36, 0.45),
+    free=(*striker.FREE, *GIRDLE),
+    held_limits=(
+        *("L_Thorax_x", "L_Thorax_y", "L_Thorax_z", "Neck_x", "Neck_y", "Head_y"),
+        *striker.HELD_LIMITS[3:],
+    ),
+    closing=CLOSING,
+    share=0.87,
+    full=True,
+)
+FAST = 15.0
+"""A stroke above this speed (m/s) is a full swing, in which the shoulder girdle moves too."""
+
+
 GAP = (0.03, 0.06)
 """Between the ball of the left hand and the right one (m)."""
 CORNERS = 0.025
@@ -70,6 +122,11 @@ STANCE = ((0.45, 0.65), (-0.05, 0.05))
 """How far the left foot stands to the left of and ahead of the right one (m)."""
 FLARE = {"L": (-0.1, 0.4), "R": (-0.4, 0.1)}
 """Sine of the angle by which a foot points to the left of straight ahead."""
+WAIST = 0.02
+"""How far the right forearm keeps off pelvis and waist (m)."""
+PLANE = 0.78
+"""The club stays where height and distance ahead of the middle between the feet add up to more (m):
+thighs and knees do not."""
 BOTH = 0.3
 """Share of body weight that each foot carries at least: who stands on one topples in a replay."""
 SPREAD = 0.02
@@ -108,6 +165,11 @@ class Config(striker.Config):
             raise ValueError(f"attack must lie between -5 and 15 degrees, not {self.attack}")
 
 
+def kind_of(config: Config) -> Kind:
+    """Chip or full swing, by the asked speed."""
+    return SWING if config.club_speed > FAST else CHIP
+
+
 def club(body: Body) -> list[Ball]:
     """Balls around shaft and head, for clearances."""
     shaft, head = body.links[body.link_index(LINK)].shapes
@@ -138,19 +200,25 @@ def transcribe(
 ) -> Transcription:
     """The nonlinear program."""
     knots = jumper.scaled(config.detail)
+    kind = kind_of(config)
+    back, swing, follow = kind.durations
+    counts = [knots(n) for n in kind.intervals]
     phases = [
-        Phase("back", knots(12), BACK, FEET),
-        Phase("swing", knots(18), SWING, FEET),
-        Phase("follow", knots(11), FOLLOW, FEET),
+        Phase("back", counts[0], back, FEET, closing=kind.closing),
+        Phase("swing", counts[1], swing, FEET, closing=kind.closing),
+        Phase("follow", counts[2], follow, FEET, grading=kind.closing),
     ]
     program = striker.transcribe(
         body,
         event,
         phases,
         config,
+        free=kind.free,
         position=POSITION,
+        held_limits=kind.held_limits,
         tool=club(body),
         feet=STANCE,
+        bounds={"torque_share": kind.share},
         shear=SHEAR,
         comfort=COMFORT,
         elastic=elastic,
@@ -159,9 +227,12 @@ def transcribe(
         Ball(LINK, (float(x), float(y), float(z)), 0.0) for x, y, z in tee_shot.head_corners(body)
     ]
     program.ground(corners, np.arange(program.K), MARGIN)
+    if kind.full:
+        before_the_legs(program, body)
+        off_the_waist(program, body)
     shape(program, event)
     hands_together(program, body)
-    both_feet(program, SPREAD / config.detail)
+    striker.both_feet(program, BOTH, SPREAD / config.detail)
     return program
 
 
@@ -211,6 +282,29 @@ def shape(program: Transcription, event: striker.Event) -> None:
         program.bound(program.q[-1, model.index(name)], low, high)
 
 
+def before_the_legs(program: Transcription, body: Body) -> None:
+    """Shaft and head stay before a plane that rises backwards over the legs: a distance has no
+    sign, and the club might pass through a leg between two knots."""
+    model, balls = program.model, club(body)
+
+    def before(q, p):
+        motion = model.motion(q)
+        points = [motion.point(model.tree.link(b.link), b.center) for b in balls]
+        gaps = [point[0] + point[2] - PLANE - b.radius for point, b in zip(points, balls)]
+        return [("before the legs", ca.vertcat(*gaps) / 0.1, 0.0, np.inf)]
+
+    program.rows("before the legs", np.arange(program.K), before)
+
+
+def off_the_waist(program: Transcription, body: Body) -> None:
+    """The right forearm keeps off pelvis and waist."""
+    pelvis = [replace(b, radius=b.radius + CORNERS) for b in axis_balls(body, "Pelvis")]
+    arm = [*axis_balls(body, "R_Elbow", 3), *axis_balls(body, "R_Wrist")]
+    waist = [*pelvis, *axis_balls(body, "Torso"), *axis_balls(body, "Spine")]
+    pairs = [(a, b) for a in arm for b in waist]
+    clearance.keep_off(program, pairs, np.arange(program.K), WAIST)
+
+
 def hands_together(program: Transcription, body: Body) -> None:
     """The left hand stays beside the right one, as in a grip, without touching the right arm."""
     model = program.model
@@ -229,20 +323,8 @@ def hands_together(program: Transcription, body: Body) -> None:
     program.rows("hands", np.arange(program.K), beside)
 
 
-def both_feet(program: Transcription, price: float) -> None:
-    """Each foot carries its share of the weight, and by a ``price`` evenly over its sole."""
-    least = BOTH * program.weight
-    for side, forces in program.f.items():
-        up = np.array([index[:, 2] for index in forces.values()])
-
-        def carried(f, p):
-            rows = [("weight on both feet", ca.sum1(f) / least, 1.0, np.inf)]
-            return price * ca.sumsqr(f / program.weight), rows
-
-        program.program.block(f"load {side}", [up], carried)
-
-
 POSITION = {
+    **dict.fromkeys(GIRDLE, (-0.4, 0.4)),
     "R_Shoulder_z": (-0.9, 2.1),
     "R_Elbow_z": (0.05, 2.4),
     "R_Elbow_y": (-1.5, 1.5),
@@ -268,12 +350,13 @@ def solve(
     """The least-effort stroke. See :meth:`warmstart.problems.Problem.solve`."""
     body = load_body("smpl", strength=config.strength, equipment=["club"])
     event = make_event(config, body)
+    kind = kind_of(config)
     return striker.solve(
         "golf",
         {"club_speed": config.club_speed},
         event,
         lambda elastic: transcribe(config, body, event, elastic),
-        lambda program: striker.key_guess(program, "golf", DURATIONS),
+        lambda program: striker.key_guess(program, kind.keys, kind.guess),
         guess,
         config,
         progress,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -21,29 +21,52 @@ from sports.javelin import END
 from warmstart.contact import Ball
 from warmstart.phases import Phase
 from warmstart.problems import clearance, jumper, striker
+from warmstart.separation import axis_balls
 from warmstart.solution import Solution
 from warmstart.transcription import Transcription
 
 LINK = "R_Wrist"
 GRIP = (-0.007, -0.06, -0.045)
 """The javelin's centre of mass on that link (m), as in ``sports/humanoid/data/equipment.csv``."""
+MASS = 0.8
+"""kg"""
 NOSE = (-1.0, 0.0, 0.0)
 ENDS = tuple(
     Ball(LINK, (GRIP[0] + side * END, GRIP[1], GRIP[2]), JAVELIN_RADIUS) for side in (-1.0, 1.0)
 )
 OPENING = 0.002
 """Time in which the hand opens (s)."""
+GIRDLE = ("R_Thorax_x", "R_Thorax_y", "R_Thorax_z")
+"""The shoulder girdle of the throwing arm moves too."""
 FEET = {"L": "flat", "R": "flat"}
-SWING, FOLLOW = (0.35, 0.70), (0.30, 0.50)
-"""Durations (s) until the release, and after it."""
-DURATIONS = (0.70, OPENING, 0.30)
+DRAW, SWING, FOLLOW = (0.20, 0.45), (0.16, 0.35), (0.30, 0.50)
+"""Durations (s): the slow first part, with long steps; until the release; and after it."""
+DURATIONS = (0.45, 0.25, OPENING, 0.30)
 """Of the phases in a first guess (s)."""
+CLOSING = 4.0
+"""How many times shorter the last step before the release is: the wrist works fast there."""
 TILT = math.radians(35.0)
 """How far the held javelin may point from where it will fly."""
-SHEAR = 600.0
+SHEAR = 4000.0
 """Weight of horizontal force on the feet: a throw pushes harder than a stroke."""
+CORNERS = 0.03
+"""How far the corners of the left hand stick out of its ball (m)."""
 STRAIGHT = 170.0
 """How much the javelin may be accelerated across its way at the release (m/s^2)."""
+STANCE = ((0.15, 0.6), (0.4, 0.9))
+"""How far the left foot stands to the left of and ahead of the right one (m)."""
+FRICTION = {"friction_x": 0.4, "friction_y": 0.3}
+"""Shares of its load that a sole point may push with along the ground."""
+BOTH = 0.1
+"""Share of body weight that each foot carries at least."""
+SPREAD = 0.02
+"""Cost at one knot of the squared load of a sole point over body weight."""
+EASY = 0.8
+"""Share of its torque limit that the wrist may use: it needs more between two knots."""
+DROP = 225.0
+"""How much the force that the javelin needs may change while the hand opens (N)."""
+JERK = 6.0
+"""How much the moment that it needs at the wrist may change while the hand opens (N m)."""
 SPIN = 1.0
 """How fast the javelin may turn at the release (rad/s, each axis)."""
 
@@ -95,25 +118,35 @@ def transcribe(
     """The nonlinear program."""
     knots = jumper.scaled(config.detail)
     phases = [
-        Phase("swing", knots(32), SWING, FEET),
+        Phase("draw", knots(14), DRAW, FEET),
+        Phase("swing", knots(26), SWING, FEET, closing=CLOSING),
         Phase("release", 1, (OPENING, OPENING), FEET, abrupt=True),
-        Phase("follow", knots(14), FOLLOW, FEET, loaded=False),
+        Phase("follow", knots(18), FOLLOW, FEET, grading=CLOSING, loaded=False),
     ]
     program = striker.transcribe(
         body,
         event,
         phases,
         config,
+        free=FREE,
         position=POSITION,
+        rate=RATE,
         held_limits=HELD_LIMITS,
         unloaded=bare,
         shear=SHEAR,
-        feet=((0.15, 0.6), (0.2, 0.9)),
+        bounds=FRICTION,
+        feet=STANCE,
         elastic=elastic,
     )
     held = np.array([k for k in range(program.K) if program.model_at(k) is program.model])
     program.ground(ENDS, held, margin=0.05)
+    hand, thighs = axis_balls(body, "L_Hand")[-1], axis_balls(body, "L_Hip", 3)
+    fist = replace(hand, radius=hand.radius + CORNERS)
+    arm = [*axis_balls(body, "L_Elbow"), *axis_balls(body, "L_Wrist"), fist]
+    clearance.beside_shaft(program, event, arm, JAVELIN_RADIUS, held)
     clearance.shaft_off(program, body, event, JAVELIN_RADIUS, held)
+    striker.both_feet(program, BOTH, SPREAD / config.detail)
+    opens(program)
     link, forward = program.model.tree.link(LINK), list(event.normal)
 
     def point(q, p):
@@ -121,6 +154,12 @@ def transcribe(
         return [("nose", ca.dot(nose, ca.DM(forward)), math.cos(TILT), np.inf)]
 
     program.rows("nose", held, point)
+    clearance.keep_off(program, [(fist, b) for b in thighs], np.arange(program.K))
+    if not elastic:
+        for axis in "xyz":
+            i = program.model.free.index(f"{LINK}_{axis}")
+            most = EASY * program.effort[i] / program.bounds.torque_share
+            program.bound(program.u[:, i], -most, most)
     for name, (low, high) in READY.items():
         program.bound(program.q[0, program.model.index(name)], low, high)
     for name in ("pitch", "roll"):
@@ -128,13 +167,41 @@ def transcribe(
     return program
 
 
+def opens(program: Transcription) -> None:
+    """What the javelin asks of the wrist hardly changes while the hand opens: mass and acceleration
+    change together there, so that between the two knots the torque is no straight line."""
+    model, link, middle = program.model, program.model.tree.link(LINK), ca.DM(list(GRIP))
+    turning = ca.DM([0.0, MASS * END**2 / 3.0, MASS * END**2 / 3.0])
+
+    def needs(state):
+        motion = model.motion(*state)
+        w, alpha = motion.w[link], motion.alpha[link]
+        own = motion.acc[link] + ca.cross(alpha, middle) + ca.cross(w, ca.cross(w, middle))
+        return MASS * own, MASS * ca.cross(middle, own) + turning * alpha
+
+    def build(*x):
+        (force, moment), (later, twist) = needs(x[:3]), needs(x[3:6])
+        drop = ca.sumsqr(later - force) / DROP**2
+        return 0.0, [
+            ("opening, force", drop, -np.inf, 1.0),
+            ("opening, moment", (twist - moment) / 20.0, -JERK / 20.0, JERK / 20.0),
+        ]
+
+    ends = program.knots("release")
+    states = [x[[k]] for k in ends for x in (program.q, program.v, program.a)]
+    program.program.block("opening", states, build)
+
+
+FREE = (*striker.FREE, *GIRDLE)
 HELD_LIMITS = (
-    *striker.HELD_LIMITS[:4],
-    *(d for d in striker.HELD_LIMITS[7:]),
+    *("L_Thorax_x", "L_Thorax_y", "L_Thorax_z", "L_Elbow_x", "Neck_x", "Neck_y", "Head_y"),
+    "R_Elbow_x",
+    *striker.HELD_LIMITS[7:],
 )
 POSITION = {
     "yaw": (-1.6, 0.8),
     "Knee_y": (0.1, 1.6),
+    **dict.fromkeys(GIRDLE, (-0.4, 0.4)),
     "R_Shoulder_x": (-1.4, 0.8),
     "R_Shoulder_y": (-1.4, 1.4),
     "R_Shoulder_z": (-1.2, 1.9),
@@ -144,6 +211,8 @@ POSITION = {
     "R_Wrist_z": (-1.2, 1.2),
 }
 """Pose boxes (rad) that differ from those of a stroke: the throwing arm works overhead."""
+RATE = {"pitch": (-6.0, 6.0)}
+"""Rate boxes of the root (rad/s) that differ from those of a stroke."""
 READY = {"yaw": (-1.4, 0.0), "L_Shoulder_x": (-1.45, 0.2)}
 
 

@@ -327,6 +327,20 @@ def stance(
     program.rows("stance", [knot], feet)
 
 
+def both_feet(program: Transcription, share: float, price: float) -> None:
+    """Each foot carries at least a ``share`` of the weight, and by a ``price`` evenly over its
+    sole."""
+    least = share * program.weight
+    for side, forces in program.f.items():
+        up = np.array([index[:, 2] for index in forces.values()])
+
+        def carried(f, p):
+            rows = [("weight on both feet", ca.sum1(f) / least, 1.0, np.inf)]
+            return price * ca.sumsqr(f / program.weight), rows
+
+        program.program.block(f"load {side}", [up], carried)
+
+
 def key_guess(program: Transcription, name: str, durations: Sequence[float]) -> np.ndarray:
     """A first guess from key poses (``keys/NAME.csv``) and the durations of the phases (s).
 
