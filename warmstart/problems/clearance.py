@@ -15,6 +15,7 @@ import numpy as np
 
 from sports.humanoid.body import Body
 from warmstart.contact import Ball
+from warmstart.rigid_body import Motion, ReducedModel
 from warmstart.separation import axis_balls
 from warmstart.transcription import Transcription
 
@@ -59,12 +60,10 @@ def shaft_off(
     """A long shaft of a ``radius`` (m), along the event's axis through its point, stays off the
     body: the distance of balls from a line."""
     model = program.model
-    link = model.tree.link(event.link)
 
     def off(q, p):
         motion = model.motion(q)
-        along = motion.R_WL[link] @ ca.DM(list(event.axis))
-        through = motion.point(link, event.point)
+        along, through = _shaft(model, motion, event)
         gaps = []
         for b in obstacles(body):
             to = motion.point(model.tree.link(b.link), b.center) - through
@@ -80,12 +79,10 @@ def beside_shaft(
     """Balls stay to the left of that shaft or below it, on one side of the plane through it that
     rises to the left: a distance has no sign, and a limb might pass through between two knots."""
     model = program.model
-    link = model.tree.link(event.link)
 
     def beside(q, p):
         motion = model.motion(q)
-        along = motion.R_WL[link] @ ca.DM(list(event.axis))
-        through = motion.point(link, event.point)
+        along, through = _shaft(model, motion, event)
         up = ca.DM([0.0, 0.0, 1.0]) - along[2] * along
         left = ca.cross(up, along)  # as long as ``up``
         side = (left - up) / ca.sqrt(ca.sumsqr(left) + ca.sumsqr(up) + 1e-9)
@@ -97,6 +94,12 @@ def beside_shaft(
         return [("beside the shaft", ca.vertcat(*gaps) / 0.1, 0.0, np.inf)]
 
     program.rows("beside the shaft", knots, beside)
+
+
+def _shaft(model: ReducedModel, motion: Motion, event: Event):
+    """Direction (3,) of the shaft of an event and a point (3,) on it (m), world; symbolic."""
+    link = model.tree.link(event.link)
+    return motion.R_WL[link] @ ca.DM(list(event.axis)), motion.point(link, event.point)
 
 
 def arms_off(program: Transcription, body: Body, knots) -> None:

@@ -40,7 +40,6 @@ MARGIN = 0.008
 BEHIND = (0.06, 0.15)
 """How far behind its place at the impact the face is at address (m)."""
 FEET = {"L": "flat", "R": "flat"}
-GIRDLE = ("R_Thorax_x", "R_Thorax_y", "R_Thorax_z")
 CLOSING = 3.0
 """How many times shorter the steps next to the impact of a full swing are."""
 
@@ -83,7 +82,7 @@ SWING = Kind(
     intervals=(18, 24, 13),
     durations=((0.40, 0.75), (0.20, 0.36), (0.45, 0.75)),
     guess=(0.75, 0.36, 0.45),
-    free=(*striker.FREE, *GIRDLE),
+    free=(*striker.FREE, *striker.GIRDLE),
     held_limits=(
         *("L_Thorax_x", "L_Thorax_y", "L_Thorax_z", "Neck_x", "Neck_y", "Head_y"),
         *striker.HELD_LIMITS[3:],
@@ -324,7 +323,7 @@ def hands_together(program: Transcription, body: Body) -> None:
 
 
 POSITION = {
-    **dict.fromkeys(GIRDLE, (-0.4, 0.4)),
+    **striker.GIRDLE_POSITION,
     "R_Shoulder_z": (-0.9, 2.1),
     "R_Elbow_z": (0.05, 2.4),
     "R_Elbow_y": (-1.5, 1.5),

@@ -36,8 +36,6 @@ ENDS = tuple(
 )
 OPENING = 0.002
 """Time in which the hand opens (s)."""
-GIRDLE = ("R_Thorax_x", "R_Thorax_y", "R_Thorax_z")
-"""The shoulder girdle of the throwing arm moves too."""
 FEET = {"L": "flat", "R": "flat"}
 DRAW, SWING, FOLLOW = (0.20, 0.45), (0.16, 0.35), (0.30, 0.50)
 """Durations (s): the slow first part, with long steps; until the release; and after it."""
@@ -192,7 +190,7 @@ def opens(program: Transcription) -> None:
     program.program.block("opening", states, build)
 
 
-FREE = (*striker.FREE, *GIRDLE)
+FREE = (*striker.FREE, *striker.GIRDLE)
 HELD_LIMITS = (
     *("L_Thorax_x", "L_Thorax_y", "L_Thorax_z", "L_Elbow_x", "Neck_x", "Neck_y", "Head_y"),
     "R_Elbow_x",
@@ -201,7 +199,7 @@ HELD_LIMITS = (
 POSITION = {
     "yaw": (-1.6, 0.8),
     "Knee_y": (0.1, 1.6),
-    **dict.fromkeys(GIRDLE, (-0.4, 0.4)),
+    **striker.GIRDLE_POSITION,
     "R_Shoulder_x": (-1.4, 0.8),
     "R_Shoulder_y": (-1.4, 1.4),
     "R_Shoulder_z": (-1.2, 1.9),

@@ -39,8 +39,12 @@ FREE = (
     *("R_Wrist_x", "R_Wrist_y", "R_Wrist_z"),
 )
 """32 hinges: with the root the 38 degrees of freedom of a stroke."""
+GIRDLE = ("R_Thorax_x", "R_Thorax_y", "R_Thorax_z")
+"""The shoulder girdle of the right arm, which moves too in what is faster than a stroke."""
+GIRDLE_POSITION = dict.fromkeys(GIRDLE, (-0.4, 0.4))
+"""Its pose boxes (rad)."""
 HELD_LIMITS = (
-    *("R_Thorax_x", "R_Thorax_y", "R_Thorax_z", "R_Elbow_x"),
+    *(*GIRDLE, "R_Elbow_x"),
     *("R_Hand_x", "R_Hand_y", "R_Hand_z"),
     *(f"{side}_{dof}" for side in "LR" for dof in ("Knee_x", "Knee_z", "Ankle_z")),
 )
