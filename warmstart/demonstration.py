@@ -85,10 +85,15 @@ def demonstrate(
     }
     reason = ""
     if not tracked.success:
-        reason = f"tracked in MuJoCo, the task calls it no success: {clip.meta['achieved']}"
+        reason = no_success(clip, "tracked")
     elif tracked.share < 1.0:
         reason = f"tracked in MuJoCo, it reaches {100 * tracked.share:.1f} % of what was asked"
     return Demonstration(certificate, replace(clip, meta=meta), reason)
+
+
+def no_success(clip: Clip, how: str) -> str:
+    """Why a clip that was ``how`` (tracked, thrown) in MuJoCo is no demonstration."""
+    return f"{how} in MuJoCo, the task calls it no success: {clip.meta['achieved']}"
 
 
 def _thrown(
@@ -109,7 +114,7 @@ def _thrown(
         if clip.meta["achieved"].get("success") == 1.0:
             clip, certificate = labelled(clip, certificate)
             return Demonstration(certificate, clip, "")
-        reason = f"thrown in MuJoCo, the task calls it no success: {clip.meta['achieved']}"
+        reason = no_success(clip, "thrown")
     return Demonstration(certificate, clip, reason)
 
 

@@ -238,16 +238,15 @@ def _feet(body: Body, row: np.ndarray) -> str | None:
     return "".join(sorted({name[0] for name in touching}))
 
 
-def _next_step(body: Body, times: np.ndarray, qpos: np.ndarray) -> tuple[int, int] | None:
-    """First frame of the flight after the landing beyond the hurdle and first frame after it.
+def _next_step(
+    body: Body, times: np.ndarray, qpos: np.ndarray, down: int
+) -> tuple[int, int] | None:
+    """First frame of the flight after the landing beyond the hurdle, in frame ``down``, and first
+    frame after it.
 
-    None where there is no stride over the hurdle, where the next flight is not one from the lead
-    foot alone to the other one, or where anything else touches the ground before it.
+    None where the next flight is not one from the lead foot alone to the other one, or where
+    anything else touches the ground before it.
     """
-    stride = _stride(body, times, qpos)
-    if stride is None:
-        return None
-    down = stride[1]
     flight = _flight(body, times[down:], qpos[down:])
     if flight is None or flight[0] == 0 or down + flight[1] >= len(qpos):
         return None
@@ -301,7 +300,8 @@ def _step_rules(
     """Of the step after the hurdle: distance to the hurdle from the landing on, how long the lead
     foot stands, how far its toes are from where the other foot's land, the speed before that as a
     share of the run's."""
-    stride, step = _stride(body, times, qpos), _next_step(body, times, qpos)
+    stride = _stride(body, times, qpos)
+    step = None if stride is None else _next_step(body, times, qpos, stride[1])
     if stride is None or step is None:
         return {}
     (_, down), (off, end) = stride, step

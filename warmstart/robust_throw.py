@@ -32,7 +32,7 @@ from sports.physics import default_state, make_physics
 from warmstart.certificate import Certificate, certify
 from warmstart.clip import Clip
 from warmstart.cross_entropy import CrossEntropy
-from warmstart.demonstration import Demonstration, name_of, save_demonstration
+from warmstart.demonstration import Demonstration, name_of, no_success, save_demonstration
 from warmstart.other_worlds import Other, OtherWorlds
 from warmstart.performance import numbers_near
 from warmstart.refine import TASK, UNITS, Flight, Thrower, changed, throw
@@ -244,7 +244,7 @@ def demonstrate(clip: Clip, certificate: Certificate) -> Demonstration:
         return Demonstration(certificate, None, "; ".join(certificate.failures))
     reason = ""
     if clip.meta["achieved"].get("success") != 1.0:
-        reason = f"thrown in MuJoCo, the task calls it no success: {clip.meta['achieved']}"
+        reason = no_success(clip, "thrown")
     clip, certificate = labelled(clip, certificate)
     return Demonstration(certificate, clip, reason)
 
