@@ -85,15 +85,32 @@ def aim(ball: Tensor, velocity: Tensor, rim: Tensor) -> Tensor:
     return torch.exp(-0.1 * squared(velocity - shot(ball, rim)))
 
 
-def arrival(ball: Tensor, velocity: Tensor, rim: Tensor) -> Tensor:
-    """(...) distance (m) from the rim's middle at which a ball that flew on freely would come down
-    through its plane; infinite for one that would not reach it."""
+class Arrival(NamedTuple):
+    """How a ball that flew on freely would come down through the plane of a rim."""
+
+    miss: Tensor
+    """(...) distance from the rim's middle (m); infinite for a ball that would not reach it."""
+    angle: Tensor
+    """(...) of its path below the horizontal there (rad); meaningless where it would not."""
+
+    def clean(self, radius: float) -> Tensor:
+        """(...) bool: whether a ball of that radius (m) would touch the ring nowhere. Seen along
+        its path the ring is narrower by the sine of the angle."""
+        return (RING_RADIUS - self.miss) * self.angle.sin() > radius
+
+
+def arrival(ball: Tensor, velocity: Tensor, rim: Tensor) -> Arrival:
+    """Of balls at (..., 3) with velocities (..., 3) at rims (..., 3)."""
     drop = ball[..., 2] - rim[..., 2]
     square = velocity[..., 2].square() + 2 * GRAVITY * drop
-    time = (velocity[..., 2] + square.clamp(min=0.0).sqrt()) / GRAVITY
+    fall = square.clamp(min=0.0).sqrt()
+    time = (velocity[..., 2] + fall) / GRAVITY
     miss = (ball + time[..., None] * velocity - rim)[..., :2]
     reaches = (square >= 0) & (time >= 0)
-    return torch.hypot(miss[..., 0], miss[..., 1]).masked_fill(~reaches, torch.inf)
+    return Arrival(
+        miss=torch.hypot(miss[..., 0], miss[..., 1]).masked_fill(~reaches, torch.inf),
+        angle=torch.atan2(fall, torch.hypot(velocity[..., 0], velocity[..., 1])),
+    )
 
 
 class Crossing(NamedTuple):

@@ -22,6 +22,7 @@ from sports.free_throw import LOWEST, RIM
 from sports.hoop import RING_RADIUS
 from sports.physics.base import GRAVITY
 from warmstart import thrown
+from warmstart.bank import START
 from warmstart.clip import Clip
 from warmstart.cross_entropy import CrossEntropy
 from warmstart.held_ball import fingers
@@ -218,7 +219,7 @@ def throw(solution: Solution, thrower: Thrower, numbers: np.ndarray) -> Clip:
     strength = solution.body.strength
     steps = math.ceil(solution.duration / thrower.scene.control_timestep)
     played = perform(TASK, strength, "ball", thrower.targets(numbers, steps), _thrown)
-    clip, achieved, events = played.clip, dict(played.metrics), {}
+    clip, achieved, events = played.clip, dict(played.metrics), {START: 0.0}
     if True in played.seen:
         # Thrown after two free steps: the frame before them is still in the hands.
         release = max(played.seen.index(True) - 2, 0)

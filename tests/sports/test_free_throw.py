@@ -51,6 +51,7 @@ class Throw(HandMade):
         self.env.view.clock = self.env.view.clock + 1
         result = self.env.task.advance(self.env.view, self.env.memory)
         self.env.memory = result.memory
+        self.last = result
         return result
 
     def throw(self, velocity: tuple[float, float, float] = (3.7, 0.0, 6.9)) -> None:
@@ -399,13 +400,57 @@ def test_the_throw_is_the_same_in_drake():
 def test_the_entry_is_paid_as_it_was_at_the_release():
     """A ball that will come down 0.3 m beyond the rim's middle, whatever it meets afterwards."""
     world = Throw(entry=2.0)
-    up, time = 6.9, (6.9 + math.sqrt(6.9**2 - 2 * 9.81 * (3.05 - 1.9))) / 9.81
-    velocity = ((4.5 + 0.3 - 0.6) / time, 0.0, up)
     world.step(touch=20.0)
-    for ball, speed in (((0.6, 0.0, 1.9), velocity), ((0.7, 0.0, 2.1), (0.0, 0.0, 0.0))):
+    for ball, speed in (((0.6, 0.0, 1.9), coming_down(0.3)), ((0.7, 0.0, 2.1), (0.0, 0.0, 0.0))):
         step = world.step(ball, speed)
         assert step.terms["entry"][0, 0] == pytest.approx(2 * math.exp(-4 * 0.09), abs=1e-4)
     assert world.step((0.7, 0.0, 2.1), touch=0.0).terms["entry"][0, 0] > 1.0
     assert "entry" not in Throw().step().terms
     with pytest.raises(ValueError, match="must not be negative"):
         make_env("free_throw", num_worlds=1, options={"entry": -1.0})
+
+
+def test_a_narrow_entry_tells_a_ball_on_the_ring_from_one_in_the_basket():
+    """0.3 m off with a width of 0.15 m: exp(-4) of the reward."""
+    world = Throw(entry=2.0, entry_width=0.15)
+    world.step(touch=20.0)
+    step = world.step((0.6, 0.0, 1.9), coming_down(0.3))
+    assert step.terms["entry"][0, 0] == pytest.approx(2 * math.exp(-4.0), rel=2e-3)
+    with pytest.raises(ValueError, match="above 0 m"):
+        make_env("free_throw", num_worlds=1, options={"entry_width": 0.0})
+
+
+@pytest.mark.parametrize(("miss", "clean"), [(0.0, True), (0.04, True), (0.12, False)])
+def test_an_episode_may_end_at_the_release(miss: float, clean: bool):
+    """At 51 degrees a ball of 0.12 m passes the ring of 0.23 m up to 0.075 m beside its middle."""
+    world, up = Throw(release_ends=True), 6.9
+    world.step(touch=20.0)
+    assert not world.step((0.6, 0.0, 1.9), coming_down(miss)).terminated.any()
+    fallen = 1 / 30
+    later = (0.6 + coming_down(miss)[0] * fallen, 0.0, 1.9 + up * fallen - 9.81 / 2 * fallen**2)
+    speed = (coming_down(miss)[0], 0.0, up - 9.81 * fallen)
+    step = world.step(later, speed)
+    assert step.terminated.all() and step.remaining_paid.all()
+    assert bool(step.success[0]) == clean
+    assert step.terms["basket"].sum() == 0.0
+    assert step.metrics["miss"][0] == pytest.approx(miss, abs=1e-3)
+    slope = (up**2 - 2 * 9.81 * (3.05 - 1.9)) ** 0.5 / coming_down(miss)[0]
+    assert step.metrics["entry_angle"][0] == pytest.approx(math.atan(slope), abs=1e-4)
+
+
+def test_what_is_paid_at_the_release_is_what_the_flight_would_have_been_paid():
+    """Reward and steps left of the one are those of the other at the same moment."""
+    short, whole = Throw(release_ends=True, entry=1.0), Throw(entry=1.0)
+    for world in (short, whole):
+        world.throw()
+    again = whole.step((0.8, 0.0, 2.3), (3.7, 0.0, 6.5))
+    assert not again.terminated.any()
+    frozen = {name: float(term[0, 0]) for name, term in again.terms.items()}
+    assert {k: float(v[k][0, 0]) for v in [short.last.terms] for k in v} == pytest.approx(frozen)
+
+
+def coming_down(miss: float) -> tuple[float, float, float]:
+    """Velocity (m/s) of a ball at (0.6, 0, 1.9) that comes down so far (m) beyond the middle."""
+    up = 6.9
+    time = (up + math.sqrt(up**2 - 2 * 9.81 * (3.05 - 1.9))) / 9.81
+    return (4.5 + miss - 0.6) / time, 0.0, up

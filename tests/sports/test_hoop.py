@@ -163,6 +163,20 @@ def test_where_a_ball_would_arrive_is_where_it_does():
         path = pos + t * vel - torch.tensor((0.0, 0.0, 9.81 / 2)) * t * t
         last = int((path[:, 2] > rim[2]).nonzero().max())
         miss = float((path[last, :2] - rim[:2]).norm())
-        assert float(arrival(pos, vel, rim)) == pytest.approx(miss, abs=6e-3)
-    low = arrival(torch.tensor((0.4, 0.0, 1.7)), torch.tensor((4.0, 0.0, 5.0)), rim)
+        assert float(arrival(pos, vel, rim).miss) == pytest.approx(miss, abs=6e-3)
+    low = arrival(torch.tensor((0.4, 0.0, 1.7)), torch.tensor((4.0, 0.0, 5.0)), rim).miss
     assert low == torch.inf
+
+
+def test_a_clean_ball_comes_down_inside_the_ring_seen_along_its_path():
+    """Straight down a ball of 0.12 m has 0.11 m to each side; at 30 degrees the ring of 0.23 m is
+    0.115 m high as the ball sees it, and none goes in clean."""
+    rim = torch.tensor((4.5, 0.0, 3.05))
+    above = torch.tensor([(4.5 + x, 0.0, 4.0) for x in (0.1, 0.12)])
+    down = arrival(above, torch.zeros(2, 3), rim)
+    assert down.angle.tolist() == pytest.approx([math.pi / 2] * 2)
+    assert down.clean(0.12).tolist() == [True, False]
+    velocity = torch.tensor((math.sqrt(3.0), 0.0, -1.0), dtype=torch.float64)
+    flat = arrival(rim - 1e-6 * velocity, velocity, rim.double())
+    assert float(flat.angle) == pytest.approx(math.pi / 6, abs=1e-4)
+    assert not flat.clean(0.12) and flat.clean(0.114)
