@@ -72,7 +72,13 @@ class Cloning:
     """An actor (see ``rl.rollout.Actor``) that plays and labels; ``update`` learns the labels."""
 
     def __init__(
-        self, env: Any, agent: PPO, clip: Clip, iterations: int, fingers: bool = False
+        self,
+        env: Any,
+        agent: PPO,
+        clip: Clip,
+        iterations: int,
+        fingers: bool = False,
+        rates: tuple[float, float] = RATES,
     ) -> None:
         """Args:
         env: of one athlete a world.
@@ -80,16 +86,17 @@ class Cloning:
         clip: a whole episode from the task's own start; see :func:`reference`.
         iterations: how long, for the learning rate.
         fingers: they go on learning their labels afterwards.
+        rates: learning rates at the beginning and the end.
 
         Raises ValueError for a task of several athletes and for fingers that the body has not.
         """
         if env.num_agents != 1:
             raise ValueError("cloning is for tasks of one athlete")
-        self.env, self.agent, self.iterations = env, agent, iterations
+        self.env, self.agent, self.iterations, self.rates = env, agent, iterations, rates
         self.device = agent.device
         self.actions = reference(clip, env).to(self.device)
         self.led = torch.arange(env.num_worlds, device=self.device) < LED * env.num_worlds
-        self.rate = torch.tensor(RATES[0], device=self.device)
+        self.rate = torch.tensor(rates[0], device=self.device)
         cuda = self.device.type == "cuda"
         self.optimizer = torch.optim.Adam(
             agent.actor.parameters(), lr=self.rate, fused=True, capturable=cuda
@@ -140,7 +147,7 @@ class Cloning:
             off = (rollout.mean - self._kept)[..., self.fingers].square().mean(-1)
             weight = rollout.valid.float()
             return {STATISTIC: ((weight * off).sum() / weight.sum().clamp(min=1.0)).sqrt()}
-        self.rate.fill_(annealed(*RATES, done / max(self.iterations, 1)))
+        self.rate.fill_(annealed(*self.rates, done / max(self.iterations, 1)))
         obs, label = rollout.obs.flatten(0, 1), rollout.mean.flatten(0, 1)
         weight = rollout.valid.flatten().float()
         error, size = torch.zeros((), device=self.device), len(obs)

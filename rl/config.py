@@ -98,6 +98,9 @@ class TrainConfig:
     clone: int = 0
     """Iterations at the beginning in which the actor learns the targets of the one clip in
     ``clips``, a whole episode of the task (``rl/cloning.py``)."""
+    clone_rates: tuple[float, float] = (1e-3, 1e-5)
+    """Learning rates at the beginning and the end of the cloning; with ``--init`` of an actor that
+    was cloned before, begin lower."""
     clone_fingers: bool = False
     """The fingers go on learning the clip's targets for the whole run."""
     impact: float = 0.0
@@ -172,6 +175,8 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
     if c.clone < 0:
         yield f"clone must not be negative: {c.clone}"
 
+    if not 0.0 < min(c.clone_rates):
+        yield f"clone-rates must be above 0, not {c.clone_rates}"
     if c.clone_fingers and not c.clone:
         yield "--clone-fingers is for a run that clones: give --clone as well"
     if c.clone and len(c.clips) != 1:

@@ -130,7 +130,9 @@ class Lesson(Part):
 
     def __init__(self, config: TrainConfig, env: Any, agent: PPO) -> None:
         clip, self.iterations = Clip.load(config.clips[0]), config.clone
-        self.cloning = Cloning(env, agent, clip, config.clone, config.clone_fingers)
+        self.cloning = Cloning(
+            env, agent, clip, config.clone, config.clone_fingers, config.clone_rates
+        )
 
     @property
     def _going_on(self) -> bool:
