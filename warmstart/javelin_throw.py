@@ -178,6 +178,18 @@ class _Rig:
         return out
 
 
+@dataclass(frozen=True)
+class Flown:
+    """What N throws come to; all (N,)."""
+
+    far: np.ndarray
+    """How far beyond the line the javelin will fly (m); NaN where the simulation diverged."""
+    wrong: np.ndarray
+    """What is wrong with the hold, the release and the landing."""
+    aside: np.ndarray
+    """How far from the middle of the field (m)."""
+
+
 class Thrower:
     """Candidates for a throw in MuJoCo, from the task's start."""
 
@@ -248,9 +260,17 @@ class Thrower:
         """(N,) cost of candidates (N, P): minus how far the javelin will fly beyond the line (m),
         and what is wrong with the hold, the release and the landing. ``distance`` (N,) is how far,
         NaN where it would be no throw."""
-        count, scene, worlds = len(numbers), self.scene, self.worlds
         ctrl = np.stack([self.targets(row, WATCHED) for row in numbers])
-        worlds.put(count, scene.default_qpos(), np.zeros(scene.nv), np.zeros(scene.nv))
+        flown = self.fly(self.worlds, ctrl, self.scene.default_qpos())
+        self.distance = np.where(flown.wrong < 0.05, flown.far, np.nan)
+        cost = flown.wrong - flown.far + 0.2 * flown.aside + size_of(numbers)
+        return np.nan_to_num(cost, nan=1e6, posinf=1e6)
+
+    def fly(self, worlds: Worlds, ctrl: np.ndarray, start: np.ndarray) -> Flown:
+        """The throws of targets (N, WATCHED, n) (rad) in worlds of the task, from ``start`` (nq,)
+        at rest."""
+        count, scene = len(ctrl), self.scene
+        worlds.put(count, start, np.zeros(scene.nv), np.zeros(scene.nv))
         place, rate = scene.object_qpos("javelin"), scene.object_qvel("javelin")
         apart, tilt, aim = np.zeros(count), np.zeros(count), np.array(AIM)
         ahead = np.tile([1.0, 0.0, 0.0], (count, 1))
@@ -277,14 +297,15 @@ class Thrower:
         wrong = 20.0 * over(apart, NEAR) + 5.0 * over(tilt, TILTED) + 0.2 * over(push, 1.0)
         wrong += 2.0 * (over(steep, STEEP[1]) + over(-steep, -STEEP[0]))
         wrong += 0.5 * over(np.linalg.norm(turn, axis=1), SPIN)
-        aside = np.abs(state[:, 1] + velocity[:, 1] * time)
-        whole = np.isfinite(speed).all(1)
         far = np.full(count, np.nan)
-        for i in np.flatnonzero(whole):
+        for i in np.flatnonzero(np.isfinite(speed).all(1)):
             far[i] = thrown.distance(state[i, :3].copy(), velocity[i].copy(), nose[i])
-        self.distance = np.where(wrong < 0.05, far, np.nan)
-        cost = wrong - far + 0.2 * aside + 0.004 * (numbers**2).sum(1)
-        return np.nan_to_num(cost, nan=1e6, posinf=1e6)
+        return Flown(far, wrong, np.abs(state[:, 1] + velocity[:, 1] * time))
+
+
+def size_of(numbers: np.ndarray) -> np.ndarray:
+    """(N,) cost of the numbers (N, P), in their units, for their size."""
+    return 0.004 * (numbers**2).sum(1)
 
 
 def throw(thrower: Thrower, numbers: np.ndarray) -> Clip:
