@@ -18,6 +18,8 @@ from warmstart.atomic import write_json
 
 POINTS = 60
 """Rows that are kept, the first and the last among them."""
+DIGITS = 6
+"""Of every number that is not whole: more are noise, and most of the file."""
 KEPT = ("samples", "minutes", "return", "episode_steps", "samples_per_s", "nan_worlds", "overflow")
 ORIGIN = ("task", "algo", "strength", "limits", "commit", "hardware", "versions", "config")
 
@@ -51,7 +53,9 @@ def record_curve(
 
 def _number(text: str | None) -> float | None:
     value = float(text) if text else math.nan
-    return value if math.isfinite(value) else None
+    if not math.isfinite(value):
+        return None
+    return value if value.is_integer() else float(f"{value:.{DIGITS}g}")
 
 
 def main(args: Sequence[str]) -> int:

@@ -12,6 +12,10 @@ is on its own: a hand near the shaft, or a touch by any link, ends the throw as 
 carries it, kicks it on or catches it again. What touches the ground before the release does not
 count, wherever the tip is. Rewards follow the paper, so a metre of the javelin's flight pays the
 same whether the throw will count or not.
+
+By the technical rules a throw must also land tip first and go over the shoulder, not be slung. The
+paper asks for neither, so both are metrics of the throws that count here: ``tip_first`` and
+``over_arm``, the latter for a hand that stays at the shoulder's height or above for the last 0.2 s.
 """
 
 from __future__ import annotations
@@ -49,6 +53,9 @@ MAX_TILT = 0.5
 """rad off the attitude of the hold while held."""
 TOUCH = 1e-3
 """A support point this close to the ground (m) touches it."""
+LOW_HAND, DELIVERY = 0.15, 6
+"""A hand more than so far (m) below the shoulder within the last control steps (0.2 s) before the
+release slings the javelin."""
 OPEN = 0.1
 """From a fingertip's last joint to the middle of the shaft (m) where a hand is open."""
 FINGERS = ("Index", "Middle", "Ring", "Pinky", "Thumb")
@@ -116,6 +123,7 @@ def begin(view: View, context: Memory) -> Memory:
         "fall": _fall(view, _nose(ends)),
         "released": zero > 0,
         "release_speed": torch.full_like(zero, torch.nan),
+        "hand_heights": _hand_height(view)[:, None].expand(-1, DELIVERY).clone(),
     }
     if view.config.let_go > 0.0:
         memory["opening"] = _opening(view, _nose(ends))
@@ -199,8 +207,11 @@ def advance(view: View, memory: Memory) -> Advance:
     # What the hand still held when it came down was no throw: the release was seen before.
     success = landed & memory["released"] & ~failed & (distance > 0)
     speed = torch.where(memory["released"], memory["release_speed"], length(velocity))
-    metrics = nan_where(~success, torch.stack((distance, nose_first.float(), speed)))
-    metrics = dict(zip(("distance", "tip_first", "release_speed"), metrics))
+    heights = torch.cat((memory["hand_heights"][:, 1:], _hand_height(view)[:, None]), dim=1)
+    heights = torch.where(memory["released"][:, None], memory["hand_heights"], heights)
+    over_arm = (heights >= -LOW_HAND).all(-1).float()
+    metrics = nan_where(~success, torch.stack((distance, nose_first.float(), over_arm, speed)))
+    metrics = dict(zip(("distance", "tip_first", "over_arm", "release_speed"), metrics))
     metrics |= {"success": success.float(), "foul": foul.float()}
     memory = {
         "start": memory["start"],
@@ -210,6 +221,7 @@ def advance(view: View, memory: Memory) -> Advance:
         "fall": _fall(view, nose),
         "released": released,
         "release_speed": nan_where(~released, speed),
+        "hand_heights": heights,
         **shaping,
     }
     return Advance(
@@ -228,6 +240,12 @@ def _palm(view: View) -> Tensor:
     wrist = body.link_index("R_Wrist")
     palm = constant(body.links[wrist].shapes[0].center, physics.body_pos.device)
     return physics.body_pos[:, 0, wrist] + view.rotation[:, 0, wrist] @ palm
+
+
+def _hand_height(view: View) -> Tensor:
+    """(N,) height of the palm over the right shoulder (m)."""
+    shoulder = view.physics.scene.body.link_index("R_Shoulder")
+    return _palm(view)[:, 2] - view.physics.body_pos[:, 0, shoulder, 2]
 
 
 def _opening(view: View, nose: Tensor) -> Tensor:
@@ -303,6 +321,7 @@ TASK = Task(
         "success": "fraction",
         "distance": "m",
         "tip_first": "fraction",
+        "over_arm": "fraction",
         "release_speed": "m/s",
         "foul": "fraction",
     },

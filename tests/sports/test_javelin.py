@@ -528,3 +528,37 @@ def test_clocks_of_mixed_starts_survive_automatic_resets_and_a_checkpoint():
         assert torch.equal(env.age, twin.age)
     env.close()
     twin.close()
+
+
+@pytest.mark.parametrize(
+    ("low", "since", "over"), [(False, 0, 1.0), (True, 0, 0.0), (True, 7, 1.0)]
+)
+def test_a_hand_that_swings_below_the_shoulder_slings_the_javelin(low, since, over):
+    """``since``: steps with the hand up again before the release. Down is a straight arm that
+    hangs, up one at the height of the shoulder, as in a T-pose."""
+    world = Throw()
+    arm = {f"R_{joint}_{axis}": 0.0 for joint in ("Thorax", "Shoulder", "Elbow") for axis in "xyz"}
+    shoulder = world.env.physics.scene.body.link_index("R_Shoulder")
+
+    def pose(down: bool) -> float:
+        world.place((0.0, 0.0, STANDING), **arm | {"R_Shoulder_x": 1.4 if down else 0.0})
+        palm = world.palm()[2]
+        return float(palm - world.env.physics.body_pos[0, 0, shoulder, 2])
+
+    assert pose(True) < -0.4 and abs(pose(False)) < 0.15
+    world.javelin((0.3, -0.6, 1.5))
+    world.at(THROW)
+    for down in [low] * 8 + [False] * since:
+        pose(down)
+        world.javelin((0.3, -0.6, 1.5))
+        assert not ended(world.step(touched=5.0))
+    world.javelin(FAR)
+    assert not ended(world.step())
+    pose(True)  # what the hand does after the release does not matter
+    step = None
+    world.javelin((22.0, 0.0, 0.15), elevation=-0.1, velocity=(20.0, 0.0, -12.0))
+    assert not ended(world.step())
+    world.javelin((22.4, 0.0, 0.1), elevation=-0.1, velocity=(1.0, 0.0, 0.5))
+    step = world.step(ground=40.0)
+    assert step.success[0]
+    assert step.metrics["over_arm"][0] == over
