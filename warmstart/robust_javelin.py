@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from sports.humanoid.body import Strength
 from sports.scene import Scene
@@ -61,7 +62,7 @@ class Crowd:
         self.scene: Scene = self.thrower.scene
         made = {other: OtherWorlds(self.scene, candidates, threads, other) for other in COPIES}
         self.worlds = [made[other] for other in COPIES]
-        self.loose = loose_joints(self.scene, "cpu").numpy()
+        self.loose = loose_joints(self.scene, torch.device("cpu")).numpy()
 
     def fly(self, numbers: np.ndarray, seed: int) -> list[Flown]:
         """The copies of candidates (N, P); the noise is that of the ``seed``, the same for all."""
