@@ -278,7 +278,10 @@ def test_an_exported_policy_plays_like_its_run(tmp_path: Path, capsys):
     assert policy.metadata["looks"] == "idle"
     obs = 3.0 * torch.randn(20, 1, policy.metadata["obs_size"])
     torch.testing.assert_close(policy(obs), whole(obs), atol=5e-3, rtol=5e-3)  # fp16
-    small = PPOConfig(hidden=(16, 16), steps=4, minibatches=1, epochs=2)
+    limits = (1e-4, 1e-3)  # an actor that begins as another begins at the least rate
+    small = PPOConfig(
+        hidden=(16, 16), steps=4, minibatches=1, epochs=2, learning_rate_limits=limits
+    )
     seen = []
     tuned = TrainConfig(
         "long_jump", tmp_path / "tuned", worlds=2, samples=8, init=str(out), ppo=small, quiet=True
