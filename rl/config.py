@@ -120,7 +120,8 @@ class TrainConfig:
     """Where the networks live: auto (a GPU if there is one), cpu, cuda."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Of the matrix products: auto is bfloat16 on a GPU and float32 on a CPU, where bfloat16 is
-    about twice as fast if the processor has instructions for it, and slower if not."""
+    about twice as fast if the processor has instructions for it, and slower if not. bfloat16
+    knows an action of 0.5 to 0.002: take float32 where ``--ppo.sigma`` is below 0.02."""
     checkpoint_minutes: float = 2.0
     """A checkpoint at least this often."""
     checkpoint_iterations: int | None = None
