@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from rl.amp import AMPConfig
+from rl.cloning import RATES
 from rl.latent_action import LatentConfig
 from rl.ppo import PAPER, PPOConfig
 from rl.selfplay import SelfPlayConfig
@@ -98,7 +99,7 @@ class TrainConfig:
     clone: int = 0
     """Iterations at the beginning in which the actor learns the targets of the one clip in
     ``clips``, a whole episode of the task (``rl/cloning.py``)."""
-    clone_rates: tuple[float, float] = (1e-3, 1e-5)
+    clone_rates: tuple[float, float] = RATES
     """Learning rates at the beginning and the end of the cloning; with ``--init`` of an actor that
     was cloned before, begin lower."""
     clone_fingers: bool = False

@@ -171,10 +171,10 @@ def advance(view: View, memory: Memory) -> Advance:
 
     aimed = at_release("aim", 0.5 * aim(ball, velocity, rim))
     toward = at_release("toward", 0.5 * ball_games.toward(ball, velocity, rim))
+    come = arrival(ball, velocity, rim)
     shaping: Memory = {}
     if view.config.entry > 0.0:
-        miss = arrival(ball, velocity, rim).miss
-        there = torch.exp(-(miss / view.config.entry_width).square())
+        there = torch.exp(-(come.miss / view.config.entry_width).square())
         shaping["entry"] = at_release("entry", there)
 
     cross = crossing(memory["ball"], ball, rim, view.control_timestep)
@@ -192,7 +192,6 @@ def advance(view: View, memory: Memory) -> Advance:
     done = basket
     if view.config.release_ends:
         done = first_pass = thrown & ~was_thrown & ~failed
-        come = arrival(ball, velocity, rim)
         missed, angle = come.miss, come.angle
         success, basket = done & come.clean(BALL_RADIUS), torch.zeros_like(done)
     memory = {

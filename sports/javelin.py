@@ -123,7 +123,7 @@ def begin(view: View, context: Memory) -> Memory:
         "fall": _fall(view, _nose(ends)),
         "released": zero > 0,
         "release_speed": torch.full_like(zero, torch.nan),
-        "hand_heights": _hand_height(view)[:, None].expand(-1, DELIVERY).clone(),
+        "hand_heights": _height(view, _palm(view))[:, None].expand(-1, DELIVERY).clone(),
     }
     if view.config.let_go > 0.0:
         memory["opening"] = _opening(view, _nose(ends))
@@ -207,7 +207,7 @@ def advance(view: View, memory: Memory) -> Advance:
     # What the hand still held when it came down was no throw: the release was seen before.
     success = landed & memory["released"] & ~failed & (distance > 0)
     speed = torch.where(memory["released"], memory["release_speed"], length(velocity))
-    heights = torch.cat((memory["hand_heights"][:, 1:], _hand_height(view)[:, None]), dim=1)
+    heights = torch.cat((memory["hand_heights"][:, 1:], _height(view, hand)[:, None]), dim=1)
     heights = torch.where(memory["released"][:, None], memory["hand_heights"], heights)
     over_arm = (heights >= -LOW_HAND).all(-1).float()
     metrics = nan_where(~success, torch.stack((distance, nose_first.float(), over_arm, speed)))
@@ -242,10 +242,10 @@ def _palm(view: View) -> Tensor:
     return physics.body_pos[:, 0, wrist] + view.rotation[:, 0, wrist] @ palm
 
 
-def _hand_height(view: View) -> Tensor:
-    """(N,) height of the palm over the right shoulder (m)."""
+def _height(view: View, palm: Tensor) -> Tensor:
+    """(N,) height of the palm (N, 3) over the right shoulder (m)."""
     shoulder = view.physics.scene.body.link_index("R_Shoulder")
-    return _palm(view)[:, 2] - view.physics.body_pos[:, 0, shoulder, 2]
+    return palm[:, 2] - view.physics.body_pos[:, 0, shoulder, 2]
 
 
 def _opening(view: View, nose: Tensor) -> Tensor:

@@ -155,7 +155,7 @@ def search(
     """
     settings = settings or Search()
     thrower = Thrower(strength, settings, threads)
-    sought = CrossEntropy(len(UNITS), settings.candidates, settings.seed, near=near)
+    sought = CrossEntropy(len(UNITS), settings.candidates, settings.seed, near=near, noisy=True)
     middle, least = sought.mean.copy(), np.inf
     for done in range(1, settings.rounds + 1):
         asked = sought.ask()
@@ -163,7 +163,6 @@ def search(
         if cost[1] < least:  # the middle, not the luckiest: the noise differs every round
             middle, least = asked[1].copy(), float(cost[1])
         sought.tell(cost)
-        sought.best = sought.mean  # a lucky round must not stay
         if progress is not None:
             progress(done, float(cost[1]), float(thrower.baskets[1]))
     clip = throw(thrower, middle)

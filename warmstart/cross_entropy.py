@@ -25,12 +25,28 @@ class CrossEntropy:
     """
 
     def __init__(
-        self, size: int, candidates: int, seed: int = 0, near: np.ndarray | None = None
+        self,
+        size: int,
+        candidates: int,
+        seed: int = 0,
+        near: np.ndarray | None = None,
+        *,
+        spread: float = SPREAD,
+        noisy: bool = False,
     ) -> None:
+        """Args:
+        size: of a candidate.
+        candidates: of a round.
+        seed: of what is drawn.
+        near: (size,) where to begin; None for 0.
+        spread: of the candidates at the start, in units.
+        noisy: costs differ from round to round, so that a lucky one must not stay: the best is
+            the middle, whatever it cost.
+        """
         self.rng = np.random.default_rng(seed)
         self.mean = np.zeros(size) if near is None else near.copy()
-        self.spread = np.full(size, SPREAD)
-        self.best, self.least = self.mean.copy(), np.inf
+        self.spread = np.full(size, spread)
+        self.best, self.least, self.noisy = self.mean.copy(), np.inf, noisy
         self.drawn = np.zeros((candidates, size))
         elites = max(4, candidates // 6)
         weight = np.log(elites + 0.5) - np.log(np.arange(1, elites + 1))
@@ -53,4 +69,6 @@ class CrossEntropy:
         width = np.sqrt(self.weight @ (self.drawn[order] - middle) ** 2)
         self.mean = FORGET * self.mean + (1.0 - FORGET) * middle
         self.spread = KEPT * self.spread + (1.0 - KEPT) * width + LEAST_SPREAD
+        if self.noisy:
+            self.best = self.mean
         return int(order[0]) if better else None

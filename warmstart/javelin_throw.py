@@ -189,6 +189,10 @@ class Flown:
     aside: np.ndarray
     """How far from the middle of the field (m)."""
 
+    def cost(self, strict: float = 1.0) -> np.ndarray:
+        """(N,) what is wrong, weighed so, less how far (m); NaN where that is."""
+        return strict * self.wrong - self.far + 0.2 * self.aside
+
 
 class Thrower:
     """Candidates for a throw in MuJoCo, from the task's start."""
@@ -263,7 +267,7 @@ class Thrower:
         ctrl = np.stack([self.targets(row, WATCHED) for row in numbers])
         flown = self.fly(self.worlds, ctrl, self.scene.default_qpos())
         self.distance = np.where(flown.wrong < 0.05, flown.far, np.nan)
-        cost = flown.wrong - flown.far + 0.2 * flown.aside + size_of(numbers)
+        cost = flown.cost() + size_of(numbers)
         return np.nan_to_num(cost, nan=1e6, posinf=1e6)
 
     def fly(self, worlds: Worlds, ctrl: np.ndarray, start: np.ndarray) -> Flown:

@@ -43,6 +43,10 @@ class Other:
             )
 
 
+FIRM = Other(finer=2, felt=True, hold_time=0.0042, cone=True)
+"""Firmer hands on a finer time step."""
+
+
 class OtherWorlds(Worlds):
     """A batch like :class:`warmstart.tracking.Worlds`, in worlds that differ. Raises ValueError for
     contacts that are quicker than two time steps."""

@@ -29,10 +29,10 @@ from sports.starts import START_NOISE, loose_joints
 from warmstart.clip import Clip
 from warmstart.cross_entropy import CrossEntropy
 from warmstart.javelin_throw import UNITS, WATCHED, Flown, Thrower, length_of, size_of, throw
-from warmstart.other_worlds import Other, OtherWorlds
+from warmstart.other_worlds import FIRM, Other, OtherWorlds
 from warmstart.performance import numbers_near
 
-COPIES = (Other(), Other(), Other(finer=2, felt=True, hold_time=0.0042, cone=True))
+COPIES = (Other(), Other(), FIRM)
 """Worlds in which a candidate is thrown, each time with noise of its own."""
 NOISE = 2e-3
 """Of every target of every control step (rad)."""
@@ -79,9 +79,7 @@ class Crowd:
 
     def judge(self, numbers: np.ndarray, seed: int, strict: float) -> np.ndarray:
         """(N,) cost of candidates (N, P)."""
-        copies = np.array(
-            [strict * f.wrong - f.far + 0.2 * f.aside for f in self.fly(numbers, seed)]
-        )
+        copies = np.array([flown.cost(strict) for flown in self.fly(numbers, seed)])
         copies = np.nan_to_num(copies, nan=1e3, posinf=1e3)
         return copies.mean(0) + WORST * copies.max(0) + size_of(numbers)
 
@@ -101,13 +99,18 @@ def search(
     """
     settings = settings or Search()
     crowd = Crowd(strength, settings.candidates, threads)
-    sought = CrossEntropy(len(UNITS), settings.candidates, settings.seed, near=near)
-    sought.spread[:] = settings.spread
+    sought = CrossEntropy(
+        len(UNITS),
+        settings.candidates,
+        settings.seed,
+        near=near,
+        spread=settings.spread,
+        noisy=True,
+    )
     for done in range(settings.rounds):
         asked = sought.ask()
         cost = crowd.judge(asked, 10_000 * settings.seed + done, settings.strict)
         sought.tell(cost)
-        sought.best = sought.mean  # a lucky round must not stay: the noise differs
         if progress is not None:
             progress(done + 1, float(cost[1]))
     return throw(crowd.thrower, sought.mean)

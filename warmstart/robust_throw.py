@@ -33,7 +33,7 @@ from warmstart.certificate import Certificate, certify
 from warmstart.clip import Clip
 from warmstart.cross_entropy import CrossEntropy
 from warmstart.demonstration import Demonstration, name_of, no_success, save_demonstration
-from warmstart.other_worlds import Other, OtherWorlds
+from warmstart.other_worlds import FIRM, Other, OtherWorlds
 from warmstart.performance import numbers_near
 from warmstart.refine import TASK, UNITS, Flight, Thrower, changed, throw
 from warmstart.refined_throw import labelled, shown
@@ -41,8 +41,8 @@ from warmstart.solution import Solution
 
 MOTION = "refined in MuJoCo and Drake from a certified throw"
 """What such a clip is, in its own ``meta`` and in ``list``."""
-TASKS, FIRM = Other(), Other(finer=2, felt=True, hold_time=0.0042, cone=True)
-"""The worlds of the task, and firmer hands on a finer time step."""
+TASKS = Other()
+"""The worlds of the task."""
 COPIES = (
     (TASKS, (0.0, 1e-3)),
     (replace(TASKS, friction=0.9), (3e-4,)),
@@ -205,7 +205,7 @@ def search(
     """
     settings = settings or Search()
     crowd = Crowd(solution, settings.candidates, threads)
-    sought = CrossEntropy(len(UNITS), settings.candidates, settings.seed, near=near)
+    sought = CrossEntropy(len(UNITS), settings.candidates, settings.seed, near=near, noisy=True)
     done, found, least = 0, None, (True, np.inf)
 
     def tell(cost: float, off: np.ndarray, drake: bool) -> None:
@@ -220,7 +220,6 @@ def search(
             done += 1
             tell(float(cost[1]), off[:, 1], False)
             sought.tell(cost)
-            sought.best = sought.mean  # a lucky round must not stay: the noise differs
         off = crowd.visit(sought.mean, 1000 * settings.seed + 500 + turn)
         cost = float(total(off))
         tell(cost, off, True)

@@ -220,3 +220,8 @@ def test_a_body_without_fingers_has_none_to_keep(clip):
     other.close()
     with pytest.raises(ValueError, match="--clone as well"):
         TrainConfig(task="javelin", clips=(THROW,), clone_fingers=True)
+
+
+def test_a_rate_that_learns_nothing_is_refused():
+    with pytest.raises(ValueError, match="clone-rates must be above 0"):
+        TrainConfig(task="javelin", clips=(THROW,), clone=1, clone_rates=(1e-3, 0.0))
