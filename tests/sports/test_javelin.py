@@ -555,7 +555,6 @@ def test_a_hand_that_swings_below_the_shoulder_slings_the_javelin(low, since, ov
     world.javelin(FAR)
     assert not ended(world.step())
     pose(True)  # what the hand does after the release does not matter
-    step = None
     world.javelin((22.0, 0.0, 0.15), elevation=-0.1, velocity=(20.0, 0.0, -12.0))
     assert not ended(world.step())
     world.javelin((22.4, 0.0, 0.1), elevation=-0.1, velocity=(1.0, 0.0, 0.5))
