@@ -171,7 +171,8 @@ def default_env(config: TrainConfig, seed: int) -> Env:
     if config.felt_damping:
         physics_options |= {"felt_damping": True}
     if config.vary:
-        physics_options |= {"variation": Variation(), "variation_seed": seed}
+        variation = Variation(own_share=config.own_share, own_stride=config.timestep_divisor)
+        physics_options |= {"variation": variation, "variation_seed": seed}
     if config.task == PRIOR:
         from rl.distillation import make_distillation_env
 

@@ -71,6 +71,9 @@ class TrainConfig:
     ``timestep_divisor`` of 2 or 4, in time step: half of them take longer ones, up to the full
     step. In half of them contacts feel the joints' damping. A policy that must hold in every engine
     needs it."""
+    own_share: float = 0.0
+    """With ``--vary``: share of worlds in which nothing differs from the task's own, at its own
+    time step; the others vary. A policy learns to hold where it will be evaluated, too."""
     felt_damping: bool = False
     """Contacts feel the joints' damping in all worlds, as in Drake (docs/physics.md). The policy is
     then one for Drake, and may fail in evaluations on mujoco without it."""
@@ -174,6 +177,12 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
         yield "impact and impact_limit must not be negative"
     if not all(0.0 <= p <= 1.0 for p in c.start_probability):
         yield f"start_probability must lie in [0, 1], not {c.start_probability}"
+    if not 0.0 <= c.own_share <= 1.0:
+        yield f"own-share must lie in [0, 1], not {c.own_share}"
+    if c.own_share and not c.vary:
+        yield "--own-share is of worlds that vary: give --vary as well"
+    if c.own_share and c.felt_damping:
+        yield "the task's own worlds do not feel the damping: leave --own-share or --felt-damping out"
     if c.clone < 0:
         yield f"clone must not be negative: {c.clone}"
 

@@ -60,16 +60,24 @@ class Variation:
     """Time constant of the contacts of athletes with what they can hold (s). Under the 100 N of a
     finger that throws a ball sinks in by 8 mm at the model's 1/120 s, by less at 2 ms and in
     Drake."""
+    own_share: float = 0.0
+    """Share of worlds that are the task's own, in which nothing is drawn and contacts do not feel
+    the damping: for a policy that must also hold there."""
+    own_stride: int = 1
+    """Substeps that those take in one: the ``timestep_divisor``, so that theirs is the task's own
+    time step."""
 
     def __post_init__(self) -> None:
         for name in (*_RANGES, *(f"felt_{name}" for name in _FELT), "hold_time"):
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
                 raise ValueError(f"variation: {name} must be 0 < low <= high, not {low}, {high}")
-        for name in ("coarse_share", "felt_share"):
+        for name in ("coarse_share", "felt_share", "own_share"):
             share = getattr(self, name)
             if not 0.0 <= share <= 1.0:
                 raise ValueError(f"variation: {name} must be in [0, 1], not {share}")
+        if self.own_stride < 1:
+            raise ValueError(f"variation: own_stride must be at least 1, not {self.own_stride}")
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,8 @@ class Draw:
     felt: np.ndarray
     """bool, whether contacts feel the joints' damping"""
     hold_time: np.ndarray
+    own: np.ndarray
+    """bool, whether it is the task's own, with the model's contacts whatever is drawn above"""
 
     def timesteps(self, timestep: float, substeps: int) -> list[np.ndarray] | None:
         """(N,) time step of every substep: ``stride`` substeps in one, then none until the next;
@@ -100,7 +110,12 @@ def draw(
     variation: Variation, num_worlds: int, substeps: int, seed: int, all_felt: bool = False
 ) -> Draw:
     """One draw for each world of a scene with so many substeps in a control step. ``all_felt``:
-    with felt damping, whatever the share."""
+    with felt damping, whatever the share, and none of them the task's own. Raises ValueError for an
+    ``own_stride`` that does not divide the substeps."""
+    if substeps % variation.own_stride:
+        raise ValueError(
+            f"variation: own_stride {variation.own_stride} does not divide {substeps} substeps"
+        )
     rng = np.random.default_rng(seed)
 
     def uniform(span: tuple[float, float]) -> np.ndarray:
@@ -115,7 +130,12 @@ def draw(
         own = uniform(getattr(variation, f"felt_{name}"))
         values[name] = np.where(felt, own, values[name])
     values["hold_time"] = uniform(variation.hold_time)
-    return Draw(**values, stride=np.where(coarse, drawn, 1), felt=felt)
+    stride = np.where(coarse, drawn, 1)
+    own = (rng.random(num_worlds) < variation.own_share) & (not all_felt)
+    for name in ("friction", "stiffness", "damping"):
+        values[name] = np.where(own, 1.0, values[name])
+    stride, felt = np.where(own, variation.own_stride, stride), felt & ~own
+    return Draw(**values, stride=stride, felt=felt, own=own)
 
 
 class Damping(NamedTuple):
@@ -147,13 +167,15 @@ def contact_softness(
     solref: np.ndarray, solimp: np.ndarray, drawn: Draw
 ) -> tuple[np.ndarray, np.ndarray]:
     """(N, geoms, 2) ``solref`` and (N, geoms, 5) ``solimp`` of every world: as drawn for athletes
-    and ground, and for hands and what they hold; else the model's (geoms, 2) and (geoms, 5). A ball
-    bounces in one time step, however long that of its world is."""
-    ground = yields(solref)[None, :, None]
+    and ground, and for hands and what they hold; else, and in the task's own worlds, the model's
+    (geoms, 2) and (geoms, 5). A ball bounces in one time step, however long that of its world
+    is."""
+    varied = ~drawn.own[:, None]
+    ground = (yields(solref) & varied)[..., None]
     softness = np.stack((drawn.contact_time, drawn.contact_damping), axis=-1)[:, None]
     impedance = np.repeat(solimp[None], len(drawn.contact_impedance), axis=0)
     impedance[..., :2] = drawn.contact_impedance[:, None, None]
     own = np.repeat(solref[None], len(drawn.stride), axis=0)
     own[..., 1] /= np.where(is_bounce(solref), drawn.stride[:, None], 1)
-    own[..., 0] = np.where(holds(solref), drawn.hold_time[:, None], own[..., 0])
+    own[..., 0] = np.where(holds(solref) & varied, drawn.hold_time[:, None], own[..., 0])
     return np.where(ground, softness, own), np.where(ground, impedance, solimp[None])

@@ -24,7 +24,7 @@ from rl.ppo import PAPER, PPOConfig
 from rl.runlog import read_progress
 from rl.train import TrainConfig, main, parse_args, train
 from sports.env import make_env
-from sports.physics.variation import Variation
+from sports.physics.variation import Variation, draw
 from tests.rl.toy import SMALL, toy_config, toy_env
 
 ROOT = Path(__file__).parents[2]
@@ -268,3 +268,33 @@ def test_felt_damping_reaches_the_worlds(vary):
         env.close()
     assert torch.equal(moved[0], moved[1])
     assert not torch.equal(moved[0], moved[2])
+
+
+def test_a_share_of_own_worlds_reaches_the_worlds():
+    """They move as those of a run that does not vary, bit for bit; the others do not."""
+    config = TrainConfig("long_jump", worlds=8, seed=2, vary=True, own_share=0.5)
+    moved = []
+    for each in (config, TrainConfig("long_jump", worlds=8, seed=2)):
+        env = default_env(each, 2)
+        generator = torch.Generator().manual_seed(1)
+        for _ in range(4):
+            env.step(0.2 * torch.randn(8, 1, env.action_size, generator=generator))
+        moved.append(env.physics.qpos.clone())
+        substeps = env.physics.scene.substeps
+        env.close()
+    own = torch.tensor(draw(Variation(own_share=0.5), 8, substeps, 2).own)
+    assert 2 <= int(own.sum()) <= 6
+    assert torch.equal((moved[0] == moved[1]).all(1), own)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (dict(own_share=0.5), "give --vary as well"),
+        (dict(own_share=1.5, vary=True), "own-share must lie in"),
+        (dict(own_share=0.5, vary=True, felt_damping=True), "leave --own-share"),
+    ],
+)
+def test_own_worlds_that_cannot_be_are_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        TrainConfig("long_jump", **given)

@@ -311,7 +311,7 @@ def test_a_broken_world_is_counted_reset_and_alone():
 def test_worlds_that_vary_are_the_same_on_both_engines():
     pytest.importorskip("mujoco_warp")
     scene = make_scene("long_jump", timestep_divisor=4)
-    options = {"variation": Variation(), "variation_seed": 3}
+    options = {"variation": Variation(own_share=0.3, own_stride=4), "variation_seed": 3}
     c = cpu(scene, 4, **options)
     w = make_physics("warp", scene, 4, device="cpu", **options)
     plain = cpu(scene, 4)
@@ -348,6 +348,41 @@ def test_a_coarse_world_is_a_plain_world():
         assert off.max() < 2e-3 and off[:, :3].max() < 1e-4 and off.max() < 0.2 * apart
     with pytest.raises(ValueError, match="friction must be 0 < low <= high"):
         Variation(friction=(1.0, 0.5))
+
+
+@pytest.mark.parametrize("divisor", [1, 2])
+def test_a_share_of_the_worlds_that_vary_is_the_task_s_own(divisor):
+    """With ground, hands and ball: bit for bit where the time step is not divided. The others are
+    drawn as ever."""
+    n, task = 8, "free_throw"
+    scene = make_scene(task, timestep_divisor=divisor)
+    mixed = Variation(own_share=0.5, own_stride=divisor)
+    drawn, before = (draw(v, n, scene.substeps, 2) for v in (mixed, Variation()))
+    own, others = np.flatnonzero(drawn.own), np.flatnonzero(~drawn.own)
+    assert len(own) >= 2 and len(others) >= 2 and not before.own.any()
+    for name in ("friction", "stiffness", "damping", "stride", "felt"):
+        values, usual = getattr(drawn, name), getattr(before, name)
+        assert np.array_equal(values[others], usual[others])
+        expected = {"stride": divisor, "felt": False}.get(name, 1.0)
+        assert (values[own] == expected).all()
+    varied = cpu(scene, n, variation=mixed, variation_seed=2)
+    plain = cpu(make_scene(task), n)
+    body, torque = scene.body, torch.Generator().manual_seed(0)
+    rest = torch.tensor(scene.action_offset(), dtype=torch.float32)
+    for _ in range(6):
+        ctrl = (rest + 0.05 * torch.randn(body.num_dofs, generator=torque)).expand(n, -1)
+        varied.step(ctrl)
+        plain.step(ctrl)
+    off = (varied.qpos - plain.qpos).abs().amax(-1)
+    assert (off[own] == 0.0).all() if divisor == 1 else (off[own] < 1e-3).all()
+    assert (off[others] > 10.0 * off[own].max() + 1e-6).all()
+    felt = draw(mixed, n, scene.substeps, 2, all_felt=True)
+    assert felt.felt.all() and not felt.own.any()
+    for wrong in ({"own_share": -0.1}, {"own_share": 1.1}, {"own_stride": 0}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            Variation(**wrong)
+    with pytest.raises(ValueError, match="does not divide"):
+        draw(Variation(own_stride=3), n, scene.substeps, 0)
 
 
 def test_resets_are_decided_by_the_seed():
