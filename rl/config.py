@@ -182,7 +182,7 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
     if c.own_share and not c.vary:
         yield "--own-share is of worlds that vary: give --vary as well"
     if c.own_share and c.felt_damping:
-        yield "the task's own worlds do not feel the damping: leave --own-share or --felt-damping out"
+        yield "own worlds do not feel the damping: leave --own-share or --felt-damping out"
     if c.clone < 0:
         yield f"clone must not be negative: {c.clone}"
 
