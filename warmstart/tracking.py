@@ -22,7 +22,10 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from sports.ball_law.compiled import for_cpu
+from sports.ball_law.contact import Game
 from sports.humanoid.mjcf import body_name, build_spec
+from sports.physics.game import build_game, has_game
 from sports.physics.momentum import AthleteKeeper, rows_of
 from sports.registry import task_names
 from sports.scene import Scene
@@ -99,8 +102,8 @@ class Tracked:
 class Worlds:
     """A batch that plays candidates from one state, by the physics of the ``mujoco`` engine.
 
-    Like the engine it keeps the athlete's momentum; unlike it, it simulates as many worlds as
-    are asked for, in double precision, and reads no forces.
+    Like the engine it keeps the athlete's momentum and the flight of a javelin; unlike it, it
+    simulates as many worlds as are asked for, in double precision, and reads no forces.
     """
 
     def __init__(self, scene: Scene, worlds: int, threads: int, feel: bool = False) -> None:
@@ -126,6 +129,11 @@ class Worlds:
         """(N, B) links that touched the ground in any substep of the last control step; (N, 0) if
         that is not felt."""
         self._keepers: dict[int, AthleteKeeper] = {}
+        self._flying: Game | None = None
+        """A javelin, whose flight is that of the engine."""
+        if scene.ball is None and has_game(scene):
+            self._flying = build_game(scene, self.model, worlds, bind("xfrc_applied"))
+        self._even = np.full(worlds, scene.timestep)
 
     def put(self, count: int, qpos: np.ndarray, qvel: np.ndarray, warm: np.ndarray) -> None:
         """Puts the first ``count`` worlds into one state."""
@@ -144,7 +152,11 @@ class Worlds:
         self.touched = np.zeros((len(self.ids), len(self._ground)), dtype=bool)
         for substep in range(self.scene.substeps):
             last = substep == self.scene.substeps - 1
+            if self._flying is not None:
+                for_cpu().push_worlds(self._flying, self._even, self.qpos, self.qvel)
             self._substep(_VEL if last else 0)
+            if self._flying is not None:
+                for_cpu().turn_worlds(self._flying, self._even, self.qpos, self.qvel)
             self.touched |= self._sensors[: len(self.ids), self._ground].any(2)
             _, self._shift = self.keeper.correct(current=last)
 

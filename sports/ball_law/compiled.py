@@ -77,6 +77,7 @@ def for_gpu() -> types.SimpleNamespace:
             globals_[name] = wp.func(copy, module=module)
     law = types.SimpleNamespace(**globals_)
     begin_world, push_world, finish_world = law.begin_world, law.push_world, law.finish_world
+    turn_world = law.turn_world
     land_world, meet_world = law.land_world, law.meet_world
     path_world, aim_world = law.path_world, law.aim_world
     land_on_waves_world = law.land_on_waves_world
@@ -92,6 +93,10 @@ def for_gpu() -> types.SimpleNamespace:
     def push_worlds(game, timestep, qpos, qvel):
         w = wp.tid()
         push_world(game, w, timestep[w % timestep.shape[0]], qpos, qvel)
+
+    def turn_worlds(game, timestep, qpos, qvel):
+        w = wp.tid()
+        turn_world(game, w, timestep[w % timestep.shape[0]], qpos, qvel)
 
     def finish_worlds(game, timestep, qpos, qvel):
         w = wp.tid()
@@ -118,6 +123,7 @@ def for_gpu() -> types.SimpleNamespace:
 
     state = dict(qpos=matrix, qvel=matrix)
     law.begin_worlds = kernel(begin_worlds, game=game_type, **state)
+    law.turn_worlds = kernel(turn_worlds, game=game_type, timestep=row, **state)
     law.push_worlds = kernel(push_worlds, game=game_type, timestep=row, **state)
     law.finish_worlds = kernel(finish_worlds, game=game_type, timestep=row, **state)
     moving = dict(p=matrix, v=matrix, spin=matrix)

@@ -48,6 +48,8 @@ ADVANCES = 40
 """Most steps of one search for a contact."""
 FAR = 2.0
 """A share of the flight that no search finds."""
+FREE = 1e-4
+"""What nothing has touched has a velocity within this (m/s) of that of gravity and drag alone."""
 STILL = 1e-9
 """A tool that turns less than this (rad) in a substep does not turn."""
 WIDER = 1.6
@@ -102,7 +104,12 @@ class Game(NamedTuple):
     """(D, 3) of each object with drag: its body in the engine, where its numbers begin in ``qpos``
     and ``qvel``."""
     drags: Matrix
-    """(D, 2) N s^2/m^2 along its x axis and across it."""
+    """(D, 4) N s^2/m^2 along its x axis and across it, mass (kg), and its moment of inertia about
+    the x axis as a share of that about the others."""
+    tops: Cube
+    """(N, D, 11) of each object with drag, from before the substep: the velocity (m/s) that it will
+    have if nothing touches it, its angular momentum over its inertia about the y axis (rad/s),
+    quaternion, and spin about the x axis (rad/s)."""
     wrench: Cube
     """(N, bodies, 6) what the engine has to apply: force, torque about the centre of mass."""
     applied: Cube

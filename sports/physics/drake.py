@@ -19,6 +19,7 @@ contact loses little, a stiff one more, by a law of the time step alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -208,7 +209,13 @@ class DrakePhysics:
             if game is not None and law is not None:
                 self._read_states(slice(world, world + 1))
                 law.finish_world(game, world, self.timestep, *state)
-        self._put_ball(world)
+                if self._dragged:
+                    before = self._qvel[world].copy()
+                    law.turn_world(game, world, self.timestep, *state)
+                    if not np.array_equal(before, self._qvel[world]):
+                        self._put(world, self._dragged)
+        if self.scene.ball is not None:
+            self._put(world, [self.scene.ball.name])
         return bool(np.isfinite(self.plant.GetPositionsAndVelocities(context)).all())
 
     def _place(self, world: int, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
@@ -243,6 +250,7 @@ class DrakePhysics:
         """The ball and the drag, if the scene has any; the tensors that tell of the ball."""
         scene, n = self.scene, self.num_worlds
         self._game, self._law, self._pushed = None, None, [False] * n
+        self._dragged = [o.name for o in scene.objects if o.drag is not None]
         if has_game(scene):
             self._game, self._law = build_game(scene, build_model(scene), n), for_cpu()
             rigids = {
@@ -287,19 +295,20 @@ class DrakePhysics:
         port = self.plant.get_applied_spatial_force_input_port()
         port.FixValue(self._contexts[world], forces)
 
-    def _put_ball(self, world: int) -> None:
-        """Puts the ball where the law has it. In between the plant does not need to know: nothing
-        in it touches the ball."""
-        if self.scene.ball is None:
+    def _put(self, world: int, names: Sequence[str]) -> None:
+        """Puts objects where the law has them. Of the ball the plant does not need to know in
+        between: nothing in it touches the ball."""
+        if not names:
             return
-        name, context = self.scene.ball.name, self._contexts[world]
-        joint = next(o.joint for o in self._free if o.name == name)
-        p, quat = np.split(self._qpos[world, self.scene.object_qpos(name)], [3])
-        linear, spin = np.split(self._qvel[world, self.scene.object_qvel(name)], [3])
+        context = self._contexts[world]
         q, v = self.plant.GetPositions(context), self.plant.GetVelocities(context)
-        start, start_v = floating(joint)
-        q[start : start + 7] = (*quat, *p)
-        v[start_v : start_v + 6] = (*rotate(quat, spin), *linear)
+        for obj in self._free:
+            if obj.name in names:
+                p, quat = np.split(self._qpos[world, self.scene.object_qpos(obj.name)], [3])
+                linear, spin = np.split(self._qvel[world, self.scene.object_qvel(obj.name)], [3])
+                start, start_v = floating(obj.joint)
+                q[start : start + 7] = (*quat, *p)
+                v[start_v : start_v + 6] = (*rotate(quat, spin), *linear)
         self.plant.SetPositions(context, q)
         self.plant.SetVelocities(context, v)
 

@@ -36,7 +36,7 @@ from sports.ball_law.contact import (
 )
 from sports.ball_law.play import STATE_NUMBERS
 from sports.humanoid.body import Body
-from sports.scene import Scene, Surface
+from sports.scene import Scene, SceneObject, Surface
 
 _KINDS = {"plane": PLANE, "box": BOX, "disc": DISC, "waves": WAVES}
 _NO_BALL = ball_of("tennis")
@@ -97,7 +97,8 @@ def build_game(
         offsets=offsets,
         bodies=_integers(list(zip(numbers, agents)), 2),
         dragged=_integers(found, 3),
-        drags=np.array([o.drag for o in dragged], dtype=float).reshape(-1, 2),
+        drags=np.array([_top(model, o) for o in dragged]).reshape(-1, 4),
+        tops=np.zeros((n, len(dragged), 11)),
         wrench=wrench,
         applied=np.zeros((n, scene.num_agents, 6)),
     )
@@ -149,6 +150,25 @@ def _tool(model: mujoco.MjModel, link: str) -> np.ndarray:
     own[TOOL_COMPLIANCE : TOOL_COMPLIANCE + 3] = np.diag(inverse)
     own[TOOL_COMPLIANCE + 3 :] = inverse[0, 1], inverse[0, 2], inverse[1, 2]
     return own
+
+
+def _top(model: mujoco.MjModel, dragged: SceneObject) -> tuple[float, ...]:
+    """A row of ``Game.drags``. Raises ValueError for an object that is not symmetric about its x
+    axis."""
+    assert dragged.drag is not None
+    body, axes = model.body(dragged.name).id, np.empty(9)
+    mujoco.mju_quat2Mat(axes, model.body_iquat[body])
+    turn = axes.reshape(3, 3)
+    inertia = turn @ np.diag(model.body_inertia[body]) @ turn.T
+    axial, across = inertia[0, 0], inertia[1, 1]
+    if not np.allclose(inertia, np.diag([axial, across, across]), atol=1e-6 * across) or any(
+        abs(model.body_ipos[body]) > 1e-9
+    ):
+        raise ValueError(
+            f"'{dragged.name}' has drag and must be a body of revolution about its x axis, with "
+            "its centre of mass at the origin"
+        )
+    return (*dragged.drag, float(model.body_mass[body]), axial / across)
 
 
 def _chains(scene: Scene, links: list[str], agents: list[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -155,6 +155,7 @@ class WarpPhysics:
         self._kept = [wp.from_torch(view(d.cinert)), *(wp.from_torch(view(x)) for x in fields)]
         self._kept += [wp.from_torch(x) for x in (self._known, self._target, self._path)]
         self._game: dict[str, Tensor] = self._new_game() if has_game(scene) else {}
+        self._turns = any(o.drag is not None for o in scene.objects)
         surfaces = len(scene.surfaces) if scene.ball is not None else 0
         nothing = torch.zeros(n, surfaces, device=self.device)
         self.ball_hits = self._game.get("hits", nothing.int())
@@ -329,6 +330,8 @@ class WarpPhysics:
                 wp.launch(kernels.damp, dim=d.qvel.shape, inputs=inputs, outputs=[d.qfrc_applied])
             with faster(self._pieces):
                 mjw.step(self.m, d)
+            if self._turns:
+                self._ask_law("turn_worlds", self._timesteps[i])
             mjw.contact_force(self.m, d, self._contact_ids, True, self._contact_force)
             wp.launch(
                 kernels.sum_contacts,

@@ -129,6 +129,8 @@ class Worlds:
             if self._felt is not None:
                 np.multiply(self._felt, self.qvel, out=self._friction)
             self.batch.step()
+            if game is not None:
+                self._law.turn_worlds(game, timestep, *state)
             look_at_contacts(self._sensors, self._peaks, *forces, TOO_MUCH)
             for ball in self._balls:
                 ball.roll(timestep, self._sensors, self.qpos, self.qvel)

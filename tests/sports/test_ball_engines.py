@@ -173,6 +173,63 @@ def test_drag_of_an_object_is_its_equation(name):
     assert physics.ball_hits.shape == (1, 0)
 
 
+@pytest.mark.parametrize("spin", [0.0, 40.0, -250.0])
+@pytest.mark.parametrize("name", ENGINES)
+def test_a_thrown_rod_keeps_its_angular_momentum(name, spin):
+    """A rod that spins about its axis, fast as a javelin does, while the axis turns slowly: against
+    Euler's equations, by scipy. Then it lands: what is touched is the engine's."""
+    attitude = Rotation.from_euler("y", -0.4)
+    quat = tuple(attitude.as_quat(scalar_first=True).tolist())
+    half, radius, mass = 1.3, 0.012, 0.8
+    rod = Shape("capsule", (-half, 0.0, 0.0), (radius,), mass, end=(half, 0.0, 0.0))
+    thing = SceneObject("rod", (rod,), "free", (0.0, 0.0, 6.0), quat, drag=(0.0005, 0.004))
+    scene = Scene("field", load_body(), objects=(thing,))
+    physics = engine(name, scene, 1)
+    model = build_model(scene)
+    inertia = model.body_inertia[model.body("rod").id]
+    axial, across = inertia.min(), inertia.max()
+    state = default_state(scene, 1, "cpu")
+    rates = np.array((spin, 1.1, -0.7))
+    start = torch.tensor((12.0, 0.0, 3.0, *rates)).float()
+    state.qvel[:, scene.object_qvel("rod")] = start
+    physics.reset(everyone(1), state)
+    steps = 30
+
+    def rate(_, y):
+        w, own = y[:3], Rotation.from_quat(y[3:], scalar_first=True)
+        turning = (axial - across) / across
+        q = np.concatenate([[0.0], own.apply(w)])
+        quat = y[3:]
+        dq = 0.5 * np.concatenate(
+            [[-q[1:] @ quat[1:]], quat[0] * q[1:] + np.cross(q[1:], quat[1:])]
+        )
+        return [0.0, -turning * w[0] * w[2], turning * w[0] * w[1], *dq]
+
+    time = steps * scene.control_timestep
+    exact = solve_ivp(rate, (0, time), [*rates, *quat], rtol=1e-10, atol=1e-12).y[:, -1]
+    nose = Rotation.from_quat(exact[3:], scalar_first=True).apply((1.0, 0.0, 0.0))
+    for _ in range(steps):
+        physics.step(torch.zeros(1, scene.nu))
+    found = physics.qvel[0, scene.object_qvel("rod")][3:].numpy().copy()
+    turned = Rotation.from_quat(physics.object_quat[0, 0].numpy(), scalar_first=True)
+    off = np.linalg.norm(turned.apply((1.0, 0.0, 0.0)) - nose)
+    print(f"{name}: axis {off:.1e} off after {time:.1f} s, spin {found[0]:.1f} rad/s")
+    assert np.linalg.norm(nose - attitude.apply((1.0, 0.0, 0.0))) > 1.0
+    assert off < 2e-3 and found[0] == pytest.approx(spin, abs=1e-3)
+    np.testing.assert_allclose(found[1:], exact[1:3], atol=0.02)
+    for _ in range(30):
+        physics.step(torch.zeros(1, scene.nu))
+    assert physics.object_pos[0, 0, 2] < 1.5 and not physics.bad.any()
+    assert np.linalg.norm(physics.qvel[0, scene.object_qvel("rod")][3:].numpy() - found) > 0.1
+
+
+def test_what_has_drag_must_be_a_body_of_revolution():
+    plank = Shape("box", (0.0, 0.0, 0.0), (1.0, 0.1, 0.02), 1.0)
+    thing = SceneObject("plank", (plank,), "free", (0.0, 0.0, 6.0), drag=(0.0, 0.0))
+    with pytest.raises(ValueError, match="body of revolution"):
+        engine("mujoco", Scene("field", load_body(), objects=(thing,)), 1)
+
+
 def random_tables(seed):
     """Balls around all kinds of surfaces, half of them on tools in motion: (scene, Law, poses)."""
     rng = np.random.default_rng(seed)
