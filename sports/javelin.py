@@ -13,9 +13,11 @@ carries it, kicks it on or catches it again. What touches the ground before the 
 count, wherever the tip is. Rewards follow the paper, so a metre of the javelin's flight pays the
 same whether the throw will count or not.
 
-By the technical rules a throw must also land tip first and go over the shoulder, not be slung. The
-paper asks for neither, so both are metrics of the throws that count here: ``tip_first`` and
-``over_arm``, the latter for a hand that stays at the shoulder's height or above for the last 0.2 s.
+By the technical rules a throw goes over the shoulder or the upper part of the throwing arm and is
+not slung. The paper does not ask how; a search or a policy that is not asked slings, and twice as
+far. So a throw counts only if the hand was at the shoulder's height or above for the last 0.2 s
+before the release (``over_arm``); ``sling`` asks no more than the paper does. The same rules want
+the tip to land first: ``tip_first`` is a metric of the throws that count, as the paper has it.
 """
 
 from __future__ import annotations
@@ -81,6 +83,8 @@ class Javelin:
     train with: the longer a hand pushes the further it throws, so an athlete that learned with the
     rules' own deadline lets go in the very last step, shaken loose by the noise of its actions, and
     without that noise never does."""
+    sling: bool = False
+    """Whether a slung throw counts, as it does in the paper."""
 
     def __post_init__(self) -> None:
         if not THROW_STEPS < self.deadline <= RELEASE_STEPS:
@@ -205,14 +209,19 @@ def advance(view: View, memory: Memory) -> Advance:
     mark, nose_first = _landing(*before, view.control_timestep)
     distance = mark - LINE_X
     # What the hand still held when it came down was no throw: the release was seen before.
-    success = landed & memory["released"] & ~failed & (distance > 0)
+    thrown = landed & memory["released"] & ~failed & (distance > 0)
     speed = torch.where(memory["released"], memory["release_speed"], length(velocity))
     heights = torch.cat((memory["hand_heights"][:, 1:], _height(view, hand)[:, None]), dim=1)
     heights = torch.where(memory["released"][:, None], memory["hand_heights"], heights)
-    over_arm = (heights >= -LOW_HAND).all(-1).float()
-    metrics = nan_where(~success, torch.stack((distance, nose_first.float(), over_arm, speed)))
-    metrics = dict(zip(("distance", "tip_first", "over_arm", "release_speed"), metrics))
-    metrics |= {"success": success.float(), "foul": foul.float()}
+    over_arm = (heights >= -LOW_HAND).all(-1)
+    success = thrown if view.config.sling else thrown & over_arm
+    metrics = nan_where(~success, torch.stack((distance, nose_first.float(), speed)))
+    metrics = dict(zip(("distance", "tip_first", "release_speed"), metrics))
+    metrics |= {
+        "over_arm": nan_where(~thrown, over_arm.float()),
+        "success": success.float(),
+        "foul": foul.float(),
+    }
     memory = {
         "start": memory["start"],
         "x": x.clone(),

@@ -4,22 +4,15 @@ The certified throws of ``solve javelin`` have the javelin rigid on a hand witho
 another stance. Here the task's own athlete throws its own javelin from its own hold, by friction
 alone. The arm and the trunk draw the javelin back along the line on which it will fly and push it
 along that line (inverse kinematics), with the torques of inverse dynamics, and then the fingers
-open. Numbers change that: see ``BASE`` and ``BUMPED``. They are sought by the cross-entropy method
-until the throw is long by the task's own rules and lands tip first. Targets are held over control
-steps of 1/30 s as a policy's are, and every frame of the clip is a state which MuJoCo reached from
-the task's own start.
-
-``python -m warmstart.javelin_throw --out FILE.npz`` writes the clip.
+open. Numbers change that: see ``BASE`` and ``BUMPED``. :mod:`warmstart.robust_javelin` seeks them,
+for throws that are long by the task's own rules, go over the shoulder and land tip first. Targets
+are held over control steps of 1/30 s as a policy's are, and every frame of the clip is a state
+which MuJoCo reached from the task's own start.
 """
 
 from __future__ import annotations
 
-import argparse
-import math
-import sys
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -28,13 +21,13 @@ from scipy.optimize import least_squares
 from sports.env import Env, make_scene
 from sports.humanoid.body import FINGERS, Strength, load_body
 from sports.humanoid.mjcf import body_name, build_model
-from sports.javelin import AIM, HOLD_STEPS
+from sports.javelin import AIM, DELIVERY, HOLD_STEPS, LOW_HAND, REACH
+from sports.javelin import END as TIP
 from sports.physics.base import GRAVITY
 from sports.scene import Scene, humanoid_scene
 from warmstart import rotation, thrown
 from warmstart.clip import Clip
-from warmstart.cross_entropy import CrossEntropy
-from warmstart.performance import numbers_near, perform, searched_clip
+from warmstart.performance import perform, searched_clip
 from warmstart.tracking import Worlds
 
 TASK = "javelin"
@@ -85,26 +78,17 @@ WATCHED = 30
 NEAR, TILTED = 0.12, 0.4
 """Palm to grip (m) and angle off the hold (rad) that candidates keep while they must hold: the
 rules say 0.15 and 0.5."""
-STEEP = (-1.0, -0.15)
+STEEP = (-1.0, -0.25)
 """Elevation of the nose where the javelin lands (rad)."""
 SPIN = 1.5
 """Fastest turn of the javelin in flight (rad/s)."""
+OVER_ARM = LOW_HAND - 0.05
+"""How far below the shoulder the palm may be within the last control steps before the release (m):
+the rules say 0.15."""
+SLUNG = 30.0
+"""Cost of a metre below that."""
 EPS = 0.01
 """Step of finite differences (s)."""
-
-
-@dataclass(frozen=True)
-class Search:
-    """Settings of the search."""
-
-    worlds: int = 32
-    """Candidates of a round."""
-    rounds: int = 120
-    asked: float = 5.0
-    """A throw so far beyond the line (m), by the task's own rules, may end the search..."""
-    patience: int = 10
-    """... when so many rounds have brought nothing longer."""
-    seed: int = 0
 
 
 class _Line:
@@ -195,11 +179,10 @@ class Flown:
 
 
 class Thrower:
-    """Candidates for a throw in MuJoCo, from the task's start."""
+    """What throws by numbers do, in MuJoCo."""
 
-    def __init__(self, strength: Strength, worlds: int, threads: int = 0) -> None:
+    def __init__(self, strength: Strength) -> None:
         self.scene = make_scene(TASK, strength=strength)
-        self.worlds = Worlds(self.scene, worlds, threads)
         body = self.scene.body
         self.line, self.rig = _Line(self.scene), _Rig(self.scene)
         self.kp = body.array("kp")
@@ -207,6 +190,7 @@ class Thrower:
         self.hold, self.limit = self.scene.action_offset(), body.action_scale()
         self.rest = self.scene.default_qpos()[7 : 7 + body.num_dofs]
         self.wrist = body.link_index("R_Wrist")
+        self.shoulder = body.link_index("R_Shoulder")
         self.palm = np.array(body.links[self.wrist].shapes[0].center)
         self.knuckles = self._bent(*(f"R_{f}1" for f in FINGERS if f != "Thumb"))
         self.joints = self._bent(*(f"R_{f}{k}" for f in FINGERS if f != "Thumb" for k in (2, 3)))
@@ -260,16 +244,6 @@ class Thrower:
         out = out.reshape(steps, parts, -1).mean(1)
         return np.clip(out, self.hold - self.limit, self.hold + self.limit)
 
-    def judge(self, numbers: np.ndarray) -> np.ndarray:
-        """(N,) cost of candidates (N, P): minus how far the javelin will fly beyond the line (m),
-        and what is wrong with the hold, the release and the landing. ``distance`` (N,) is how far,
-        NaN where it would be no throw."""
-        ctrl = np.stack([self.targets(row, WATCHED) for row in numbers])
-        flown = self.fly(self.worlds, ctrl, self.scene.default_qpos())
-        self.distance = np.where(flown.wrong < 0.05, flown.far, np.nan)
-        cost = flown.cost() + size_of(numbers)
-        return np.nan_to_num(cost, nan=1e6, posinf=1e6)
-
     def fly(self, worlds: Worlds, ctrl: np.ndarray, start: np.ndarray) -> Flown:
         """The throws of targets (N, WATCHED, n) (rad) in worlds of the task, from ``start`` (nq,)
         at rest."""
@@ -278,16 +252,22 @@ class Thrower:
         place, rate = scene.object_qpos("javelin"), scene.object_qvel("javelin")
         apart, tilt, aim = np.zeros(count), np.zeros(count), np.array(AIM)
         ahead = np.tile([1.0, 0.0, 0.0], (count, 1))
+        heights, released = np.full((count, DELIVERY), np.inf), np.zeros(count, dtype=bool)
         for k in range(WATCHED):
             before = worlds.qvel[:count, rate][:, :3].copy()
             worlds.step(ctrl[:, k])
             state, speed = worlds.qpos[:count, place], worlds.qvel[:count, rate]
             nose = rotation.rotate(state[:, 3:7], ahead)
+            turned = worlds.xmat[:count, worlds.links[self.wrist]].reshape(count, 3, 3)
+            palm = worlds.link_pos[:, self.wrist] + turned @ self.palm
+            to_palm = palm - state[:, :3]
             if k < HOLD_STEPS:
-                turned = worlds.xmat[:count, worlds.links[self.wrist]].reshape(count, 3, 3)
-                palm = worlds.link_pos[:, self.wrist] + turned @ self.palm
-                apart = np.maximum(apart, np.linalg.norm(palm - state[:, :3], axis=1))
+                apart = np.maximum(apart, np.linalg.norm(to_palm, axis=1))
                 tilt = np.maximum(tilt, np.arccos(np.clip(nose @ aim, -1.0, 1.0)))
+            height = palm[:, 2] - worlds.link_pos[:, self.shoulder, 2]
+            heights[~released] = np.column_stack((heights[:, 1:], height))[~released]
+            along = np.clip((to_palm * nose).sum(1), -TIP, TIP)[:, None]
+            released |= np.linalg.norm(to_palm - along * nose, axis=1) > REACH
         velocity, step = speed[:, :3], scene.control_timestep
         push = np.linalg.norm((velocity - before) / step + (0.0, 0.0, GRAVITY), axis=1)
         turn = np.cross(rotation.rotate(state[:, 3:7], speed[:, 3:]), nose)
@@ -301,6 +281,7 @@ class Thrower:
         wrong = 20.0 * over(apart, NEAR) + 5.0 * over(tilt, TILTED) + 0.2 * over(push, 1.0)
         wrong += 2.0 * (over(steep, STEEP[1]) + over(-steep, -STEEP[0]))
         wrong += 0.5 * over(np.linalg.norm(turn, axis=1), SPIN)
+        wrong += SLUNG * over(-heights.min(1), OVER_ARM)
         far = np.full(count, np.nan)
         for i in np.flatnonzero(np.isfinite(speed).all(1)):
             far[i] = thrown.distance(state[i, :3].copy(), velocity[i].copy(), nose[i])
@@ -324,75 +305,3 @@ def throw(thrower: Thrower, numbers: np.ndarray) -> Clip:
 
     played = perform(TASK, strength, scene.free_objects[0].name, ctrl, released)
     return searched_clip(played, touched, TASK, strength, numbers)
-
-
-def length_of(clip: Clip) -> float:
-    """How far (m) a throw went that counts and lands tip first; -inf for any other."""
-    achieved = clip.meta["achieved"]
-    good = achieved.get("success") == 1.0 and achieved.get("tip_first") == 1.0
-    return achieved["distance"] if good else -math.inf
-
-
-def search(
-    strength: Strength,
-    settings: Search | None = None,
-    *,
-    near: np.ndarray | None = None,
-    threads: int = 0,
-    progress: Callable[[int, float], None] | None = None,
-) -> Clip:
-    """The longest throw found, whether it counts or not; ``near`` (P,) is where to begin.
-
-    ``progress(round, distance)`` is called after every round with the best so far by its flight.
-    Raises RuntimeError when the simulation diverges.
-    """
-    settings = settings or Search()
-    thrower = Thrower(strength, settings.worlds, threads)
-    sought = CrossEntropy(len(UNITS), settings.worlds, settings.seed, near=near)
-    best, flown, since = None, -math.inf, 0
-    for done in range(1, settings.rounds + 1):
-        better, since = sought.tell(thrower.judge(sought.ask())), since + 1
-        if better is not None and thrower.distance[better] > flown + 0.1:
-            flown, since = float(thrower.distance[better]), 0
-            if flown > 0.9 * settings.asked:
-                clip = throw(thrower, sought.best)
-                if best is None or length_of(clip) > length_of(best):
-                    best = clip
-        if progress is not None:
-            progress(done, flown)
-        if best is not None and length_of(best) >= settings.asked and since >= settings.patience:
-            break
-    return best or throw(thrower, sought.best)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Searches and writes the clip; 1 when no throw counts as asked, 2 for a bad file."""
-    parser = argparse.ArgumentParser(prog="python -m warmstart.javelin_throw", description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--strength", choices=("paper", "human"), default="paper")
-    parser.add_argument("--rounds", type=int, default=Search.rounds)
-    parser.add_argument("--asked", type=float, default=Search.asked)
-    parser.add_argument("--seed", type=int, default=Search.seed)
-    parser.add_argument("--near", type=Path, help="a clip of this command, to search around")
-    options = parser.parse_args(arguments)
-    settings = Search(rounds=options.rounds, asked=options.asked, seed=options.seed)
-    try:
-        near = numbers_near(options.near, len(UNITS))
-    except ValueError as error:
-        print(f"{options.near}: {error}", file=sys.stderr)
-        return 2
-
-    def progress(done: int, flown: float) -> None:
-        print(f"round {done}: {flown:.2f} m", flush=True)
-
-    clip = search(options.strength, settings, near=near, progress=progress)
-    if length_of(clip) < options.asked:
-        print(f"no throw: {clip.meta['achieved']}", file=sys.stderr)
-        return 1
-    clip.save(options.out)
-    print(f"{options.out}: {clip.meta['achieved']}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -530,13 +530,16 @@ def test_clocks_of_mixed_starts_survive_automatic_resets_and_a_checkpoint():
     twin.close()
 
 
+@pytest.mark.parametrize("sling", [False, True])
 @pytest.mark.parametrize(
-    ("low", "since", "over"), [(False, 0, 1.0), (True, 0, 0.0), (True, 7, 1.0)]
+    ("low", "since", "over"),
+    [(False, 0, 1.0), (True, 0, 0.0), (True, 4, 0.0), (True, 5, 1.0), (True, 7, 1.0)],
 )
-def test_a_hand_that_swings_below_the_shoulder_slings_the_javelin(low, since, over):
-    """``since``: steps with the hand up again before the release. Down is a straight arm that
-    hangs, up one at the height of the shoulder, as in a T-pose."""
-    world = Throw()
+def test_a_hand_that_swings_below_the_shoulder_slings_the_javelin(low, since, over, sling):
+    """``since``: steps with the hand up again before the release, in which it is up too. Down is a
+    straight arm that hangs, up one at the height of the shoulder, as in a T-pose. What is slung
+    counts only where that was asked for."""
+    world = Throw(sling=sling)
     arm = {f"R_{joint}_{axis}": 0.0 for joint in ("Thorax", "Shoulder", "Elbow") for axis in "xyz"}
     shoulder = world.env.physics.scene.body.link_index("R_Shoulder")
 
@@ -559,5 +562,7 @@ def test_a_hand_that_swings_below_the_shoulder_slings_the_javelin(low, since, ov
     assert not ended(world.step())
     world.javelin((22.4, 0.0, 0.1), elevation=-0.1, velocity=(1.0, 0.0, 0.5))
     step = world.step(ground=40.0)
-    assert step.success[0]
+    counts = over == 1.0 or sling
+    assert step.success[0] == counts and not step.metrics["foul"][0]
+    assert bool(step.metrics["distance"].isfinite()[0]) == counts
     assert step.metrics["over_arm"][0] == over

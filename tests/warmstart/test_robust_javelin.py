@@ -2,14 +2,27 @@
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
-from warmstart import robust_javelin
-from warmstart.javelin_throw import UNITS, size_of
+from sports.humanoid.mjcf import body_name, build_model
+from warmstart import javelin_throw, robust_javelin
+from warmstart.clip import Clip
+from warmstart.javelin_throw import (
+    BASE,
+    BUMPED,
+    BUMPS,
+    OVER_ARM,
+    UNITS,
+    WATCHED,
+    size_of,
+    throw,
+)
 from warmstart.other_worlds import Other
 from warmstart.performance import numbers_near
 from warmstart.robust_javelin import WORST, Crowd, Search, main, search
+from warmstart.tracking import Worlds
 
 SHIPPED = Path(__file__).parents[2] / "warmstart" / "data" / "throws" / "javelin_paper.npz"
 
@@ -23,21 +36,19 @@ def numbers() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def crowd() -> Crowd:
-    return Crowd("paper", 3, threads=2)
+    return Crowd("paper", 2, threads=2)
 
 
 def test_without_noise_a_copy_in_the_worlds_of_the_task_is_the_throw_itself(monkeypatch, numbers):
     for name, value in (("COPIES", (Other(),)), ("NOISE", 0.0), ("START_NOISE", 0.0)):
         monkeypatch.setattr(robust_javelin, name, value)
-    own = Crowd("paper", 3, threads=2)
+    own = Crowd("paper", 2, threads=2)
     asked = np.stack([numbers, 0.5 * numbers])
     thrower = own.thrower
     (flown,) = own.fly(asked, seed=0)
+    worlds = Worlds(thrower.scene, 1, 1)
     for row, far in zip(asked, flown.far):
-        thrower.judge(row[None])
-        alone = thrower.fly(
-            thrower.worlds, thrower.targets(row, 30)[None], thrower.scene.default_qpos()
-        )
+        alone = thrower.fly(worlds, thrower.targets(row, 30)[None], thrower.scene.default_qpos())
         assert alone.far[0] == pytest.approx(far, abs=1e-9)
     expected = (1.0 + WORST) * (2.0 * flown.wrong - flown.far + 0.2 * flown.aside)
     got = own.judge(asked, seed=0, strict=2.0)
@@ -54,23 +65,61 @@ def test_all_candidates_of_a_round_meet_the_same_noise_and_rounds_meet_others(cr
 
 def test_the_shipped_throw_goes_far_with_noise_and_in_firm_hands(crowd, numbers):
     copies = crowd.fly(numbers[None], seed=3)
-    assert len(copies) == 3
+    assert len(copies) == len(robust_javelin.COPIES)
     assert all(copy.far[0] > 15.0 for copy in copies)
 
 
-def test_a_search_gives_the_throw_of_its_middle(numbers):
-    told: list[tuple[int, float]] = []
+def test_a_slung_throw_costs_what_it_goes_too_far(crowd, numbers, monkeypatch):
+    """The hand's lowest height before the release, by the kinematics of the frames of the throw
+    that the task played, is what the cost knows of it."""
+    thrower = crowd.thrower
+    start = thrower.scene.default_qpos()
+    worlds = Worlds(thrower.scene, 1, 1)
+    # The arm bent down in the last 0.3 s.
+    slung = numbers.copy()
+    bumps = slung[len(BASE) :].reshape(len(BUMPS), len(BUMPED))
+    bumps[2:, [names[0] for names in BUMPED].index("R_Shoulder_x")] += 8.0
+    clip = throw(thrower, slung)
+    model = build_model(thrower.scene, sensors=False)
+    data = mujoco.MjData(model)
+    wrist, shoulder = (model.body(body_name(0, k)).id for k in ("R_Wrist", "R_Shoulder"))
+    heights = []
+    last = round(clip.meta["events"]["release"] * clip.fps)
+    for qpos in clip.qpos[last - 4 : last + 1]:
+        data.qpos[: len(qpos)] = qpos
+        mujoco.mj_kinematics(model, data)
+        palm = data.xpos[wrist] + data.xmat[wrist].reshape(3, 3) @ thrower.palm
+        heights.append(palm[2] - data.xpos[shoulder, 2])
+    low = -min(heights) - OVER_ARM
+    assert low > 0.05
+    ctrl = thrower.targets(slung, WATCHED)[None]
+    cost = thrower.fly(worlds, ctrl, start).wrong[0]
+    monkeypatch.setattr(javelin_throw, "SLUNG", 0.0)
+    assert cost - thrower.fly(worlds, ctrl, start).wrong[0] >= 30.0 * low - 1e-6
+
+
+def test_a_search_gives_the_throw_of_its_middle_and_goes_on_from_it(numbers, tmp_path, capsys):
+    told: list[tuple[int, float, bool]] = []
+    settings = Search(candidates=4, rounds=2, spread=0.01, kept_every=1)
     clip = search(
         "paper",
         numbers,
-        Search(candidates=6, rounds=1, spread=0.01),
+        settings,
         threads=2,
-        progress=lambda done, cost: told.append((done, cost)),
+        progress=lambda done, cost, clip: told.append((done, cost, clip is not None)),
     )
-    assert [done for done, _ in told] == [1]
+    assert [(done, kept) for done, _, kept in told] == [(1, True), (2, True)]
     assert told[0][1] < 0.0
     assert clip.meta["achieved"]["success"] == 1.0
-    assert len(clip.meta["numbers"]) == len(UNITS)
+    again = search("paper", numbers, settings, threads=1)
+    assert again.meta["numbers"] == clip.meta["numbers"]
+    near, out = tmp_path / "near.npz", tmp_path / "out.npz"
+    clip.save(near)
+    few = ["--rounds", "1", "--candidates", "4", "--spread", "0.001"]
+    assert main(["--near", str(near), "--out", str(out), *few]) == 0
+    assert "round 1:" in capsys.readouterr().out
+    moved = np.abs(np.array(Clip.load(out).meta["numbers"]) - clip.meta["numbers"])
+    assert 0.0 < moved.max() < 0.1
 
 
 def test_a_clip_of_something_else_is_refused(tmp_path, capsys):
