@@ -34,7 +34,6 @@ from rl.ranks import own_rank
 from rl.rollout import Actor, Rollout
 from rl.warm_start import load_start
 from sports.env import Env, Starts, make_env
-from sports.physics.variation import Variation
 
 MakeEnv = Callable[[TrainConfig, int], Any]
 """(config, seed) -> environment."""
@@ -171,7 +170,7 @@ def default_env(config: TrainConfig, seed: int) -> Env:
     if config.felt_damping:
         physics_options |= {"felt_damping": True}
     if config.vary:
-        variation = Variation(own_share=config.own_share, own_stride=config.timestep_divisor)
+        variation = replace(config.variation, own_stride=config.timestep_divisor)
         physics_options |= {"variation": variation, "variation_seed": seed}
     if config.task == PRIOR:
         from rl.distillation import make_distillation_env

@@ -17,6 +17,7 @@ from rl.ppo import PAPER, PPOConfig
 from rl.selfplay import SelfPlayConfig
 from rl.steady import BALANCE
 from sports.env import Starts
+from sports.physics.variation import Variation
 from sports.registry import get_task, task_names
 
 DEFAULT_WORLDS = {"mujoco": 256, "warp": 8192, "drake": 4}
@@ -71,9 +72,8 @@ class TrainConfig:
     ``timestep_divisor`` of 2 or 4, in time step: half of them take longer ones, up to the full
     step. In half of them contacts feel the joints' damping. A policy that must hold in every engine
     needs it."""
-    own_share: float = 0.0
-    """With ``--vary``: share of worlds in which nothing differs from the task's own, at its own
-    time step; the others vary. A policy learns to hold where it will be evaluated, too."""
+    variation: Variation = field(default_factory=Variation)
+    """How, with ``--vary``: ranges and shares of worlds."""
     felt_damping: bool = False
     """Contacts feel the joints' damping in all worlds, as in Drake (docs/physics.md). The policy is
     then one for Drake, and may fail in evaluations on mujoco without it."""
@@ -177,12 +177,12 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
         yield "impact and impact_limit must not be negative"
     if not all(0.0 <= p <= 1.0 for p in c.start_probability):
         yield f"start_probability must lie in [0, 1], not {c.start_probability}"
-    if not 0.0 <= c.own_share <= 1.0:
-        yield f"own-share must lie in [0, 1], not {c.own_share}"
-    if c.own_share and not c.vary:
-        yield "--own-share is of worlds that vary: give --vary as well"
-    if c.own_share and c.felt_damping:
-        yield "own worlds do not feel the damping: leave --own-share or --felt-damping out"
+    if c.variation != Variation() and not c.vary:
+        yield "the --variation options are of worlds that vary: give --vary as well"
+    if c.variation.own_stride != 1:
+        yield "own-stride is the timestep-divisor: leave --variation.own-stride out"
+    if c.variation.own_share and c.felt_damping:
+        yield "own worlds do not feel damping: leave --variation.own-share or --felt-damping out"
     if c.clone < 0:
         yield f"clone must not be negative: {c.clone}"
 
@@ -279,8 +279,11 @@ def config_from_dict(data: dict[str, Any]) -> TrainConfig:
         data["clips"] = tuple(Path(p) for p in data["clips"])
         data["start_probability"] = tuple(data["start_probability"])
         latent = LatentConfig(**data.pop("latent", {}))
+        spans: dict[str, Any] = dict(data.pop("variation", {}))
+        spans = {name: tuple(x) if isinstance(x, list) else x for name, x in spans.items()}
         how = {"ppo": PPOConfig(**ppo), "amp": AMPConfig(**amp), "latent": latent}
-        return TrainConfig(**data, **how, selfplay=SelfPlayConfig(**rivals))
+        vary = Variation(**spans)
+        return TrainConfig(**data, **how, variation=vary, selfplay=SelfPlayConfig(**rivals))
     except (TypeError, KeyError) as error:
         raise ValueError(f"the run's settings cannot be read ({error})") from error
 

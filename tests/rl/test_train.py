@@ -19,6 +19,7 @@ import torch
 import rl.checkpoint
 from rl.assembly import default_env
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
+from rl.config import config_from_dict
 from rl.policy import PolicyError
 from rl.ppo import PAPER, PPOConfig
 from rl.runlog import read_progress
@@ -28,6 +29,7 @@ from sports.physics.variation import Variation, draw
 from tests.rl.toy import SMALL, toy_config, toy_env
 
 ROOT = Path(__file__).parents[2]
+OWN = Variation(own_share=0.5)
 TIMES = {"minutes", "samples_per_s", "rollout_s", "update_s"}
 
 
@@ -204,6 +206,11 @@ def test_command_line():
     config = parse_args(["high_jump", "--worlds", "8", "--task.bar-height", "1.2", "--paper"])
     assert (config.task, config.worlds, config.options["bar_height"]) == ("high_jump", 8, 1.2)
     assert config.hyper == PAPER
+    words = ["--vary", "--variation.friction", "0.8", "1.2", "--variation.own-share", "0.3"]
+    config = parse_args(["long_jump", *words])
+    assert config.variation == Variation(friction=(0.8, 1.2), own_share=0.3)
+    stored = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    assert config_from_dict(stored).variation == config.variation
     config = parse_args(["long_jump", "--ppo.sigma", "0.1", "--strength", "human"])
     assert (config.ppo.sigma, config.strength) == (0.1, "human")
 
@@ -272,7 +279,7 @@ def test_felt_damping_reaches_the_worlds(vary):
 
 def test_a_share_of_own_worlds_reaches_the_worlds():
     """They move as those of a run that does not vary, bit for bit; the others do not."""
-    config = TrainConfig("long_jump", worlds=8, seed=2, vary=True, own_share=0.5)
+    config = TrainConfig("long_jump", worlds=8, seed=2, vary=True, variation=OWN)
     moved = []
     for each in (config, TrainConfig("long_jump", worlds=8, seed=2)):
         env = default_env(each, 2)
@@ -282,7 +289,7 @@ def test_a_share_of_own_worlds_reaches_the_worlds():
         moved.append(env.physics.qpos.clone())
         substeps = env.physics.scene.substeps
         env.close()
-    own = torch.tensor(draw(Variation(own_share=0.5), 8, substeps, 2).own)
+    own = torch.tensor(draw(OWN, 8, substeps, 2).own)
     assert 2 <= int(own.sum()) <= 6
     assert torch.equal((moved[0] == moved[1]).all(1), own)
 
@@ -290,9 +297,9 @@ def test_a_share_of_own_worlds_reaches_the_worlds():
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (dict(own_share=0.5), "give --vary as well"),
-        (dict(own_share=1.5, vary=True), "own-share must lie in"),
-        (dict(own_share=0.5, vary=True, felt_damping=True), "leave --own-share"),
+        (dict(variation=OWN), "give --vary as well"),
+        (dict(variation=Variation(own_stride=2), vary=True), "is the timestep-divisor"),
+        (dict(variation=OWN, vary=True, felt_damping=True), "leave --variation.own-share"),
     ],
 )
 def test_own_worlds_that_cannot_be_are_refused(given, words):
