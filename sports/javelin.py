@@ -14,10 +14,11 @@ count, wherever the tip is. Rewards follow the paper, so a metre of the javelin'
 same whether the throw will count or not.
 
 By the technical rules a throw goes over the shoulder or the upper part of the throwing arm and is
-not slung. The paper does not ask how; a search or a policy that is not asked slings, and twice as
-far. So a throw counts only if the hand was at the shoulder's height or above for the last 0.2 s
-before the release (``over_arm``); ``sling`` asks no more than the paper does. The same rules want
-the tip to land first: ``tip_first`` is a metric of the throws that count, as the paper has it.
+not slung. The paper does not ask how, and a search that was not asked slung it past the hip. So a
+throw counts only if the hand was at the shoulder's height or above for the last 0.2 s before the
+release (``over_arm``); ``sling`` asks no more than the paper does. The same rules want the tip to
+land first: ``tip_first`` is a metric of the throws that count, as the paper has it. They also want
+it to land in a sector of 29 degrees; that is not asked here.
 """
 
 from __future__ import annotations
