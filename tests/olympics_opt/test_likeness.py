@@ -70,7 +70,7 @@ def test_panel_stands_beside_the_score(tmp_path: Path, capsys) -> None:
         (["nothing.npz"], "nothing.npz"),
         (["random"], "--task"),
         (["pretrained", "--task", "running"], "running"),
-        (["pretrained:amp"], "no policy"),
+        (["pretrained:chess"], "no policy"),
         ([KICK, "--trials", "0"], "trials"),
         ([KICK, KICK, "--out", "a.json"], "folder"),
         ([KICK, "--chart", "a.pdf"], ".png"),
