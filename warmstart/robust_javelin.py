@@ -115,6 +115,7 @@ def search(
         "verbose": -9,
     }
     sought = cma.CMAEvolutionStrategy(start, settings.spread, options)
+    clip = None
     for done in range(1, settings.rounds + 1):
         asked, middle = np.array(sought.ask()), np.array(sought.mean)
         seed = 10_000 * settings.seed + done
@@ -125,7 +126,7 @@ def search(
             clip = throw(crowd.thrower, np.array(sought.mean))
         if progress is not None:
             progress(done, float(costs[-1]), clip)
-    return throw(crowd.thrower, np.array(sought.mean))
+    return clip or throw(crowd.thrower, np.array(sought.mean))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

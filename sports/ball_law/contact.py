@@ -108,8 +108,8 @@ class Game(NamedTuple):
     the x axis as a share of that about the others."""
     tops: Cube
     """(N, D, 11) of each object with drag, from before the substep: the velocity (m/s) that it will
-    have if nothing touches it, its angular momentum over its inertia about the y axis (rad/s),
-    quaternion, and spin about the x axis (rad/s)."""
+    have if nothing touches it, quaternion, its angular momentum over its inertia about the y axis
+    (rad/s), and spin about the x axis (rad/s)."""
     wrench: Cube
     """(N, bodies, 6) what the engine has to apply: force, torque about the centre of mass."""
     applied: Cube

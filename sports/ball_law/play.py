@@ -432,14 +432,9 @@ def turn_world(game: Game, w: int, dt: float, qpos: Matrix, qvel: Matrix) -> Non
         q, v = game.dragged[j, 1], game.dragged[j, 2]
         change = ahead(row(qvel, w, v), -1.0, cell(game.tops, w, j, 0))
         if dt > 0.0 and length(change) < FREE:
-            momentum, spin = cell(game.tops, w, j, 3), float(game.tops[w, j, 10])
-            own = quat(
-                float(game.tops[w, j, 6]),
-                float(game.tops[w, j, 7]),
-                float(game.tops[w, j, 8]),
-                float(game.tops[w, j, 9]),
-            )
+            momentum, spin = cell(game.tops, w, j, 7), float(game.tops[w, j, 10])
             half = 0.5 * (1.0 - game.drags[j, 3]) * spin * dt
+            own = posture(game.tops, w, j)
             own = product(own, quat(math.cos(half), math.sin(half), 0.0, 0.0))
             own = spun(own, momentum, dt)
             side = project(axis_x(own), axis_y(own), axis_z(own), momentum)
@@ -477,12 +472,12 @@ def push_world(game: Game, w: int, dt: float, qpos: Matrix, qvel: Matrix) -> Non
             game.applied[w, athlete, 3 + k] = game.applied[w, athlete, 3 + k] + moment[k]
     for j in range(game.dragged.shape[0]):
         q, v = game.dragged[j, 1], game.dragged[j, 2]
-        axis, velocity = axis_x(attitude(qpos, w, q + 3)), row(qvel, w, v)
+        own, velocity, spin = attitude(qpos, w, q + 3), row(qvel, w, v), row(qvel, w, v + 3)
+        axis = axis_x(own)
         along = dot(axis, velocity)
         aside = ahead(velocity, -along, axis)
         force = times(-game.drags[j, 0] * abs(along) * along, axis)
         force = ahead(force, -game.drags[j, 1] * length(aside), aside)
-        own, spin = attitude(qpos, w, q + 3), row(qvel, w, v + 3)
         velocity = ahead(velocity, dt / game.drags[j, 2], force)
         turn = vec(game.drags[j, 3] * spin[0], spin[1], spin[2])
         turn = combine(axis, axis_y(own), axis_z(own), turn)
@@ -490,10 +485,10 @@ def push_world(game: Game, w: int, dt: float, qpos: Matrix, qvel: Matrix) -> Non
             game.wrench[w, game.dragged[j, 0], k] = force[k]
             game.wrench[w, game.dragged[j, 0], 3 + k] = 0.0
             game.tops[w, j, k] = velocity[k]
-            game.tops[w, j, 3 + k] = turn[k]
+            game.tops[w, j, 7 + k] = turn[k]
         game.tops[w, j, 2] = velocity[2] - GRAVITY * dt
         for k in range(4):
-            game.tops[w, j, 6 + k] = own[k]
+            game.tops[w, j, 3 + k] = own[k]
         game.tops[w, j, 10] = spin[0]
 
 

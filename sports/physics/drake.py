@@ -298,8 +298,6 @@ class DrakePhysics:
     def _put(self, world: int, names: Sequence[str]) -> None:
         """Puts objects where the law has them. Of the ball the plant does not need to know in
         between: nothing in it touches the ball."""
-        if not names:
-            return
         context = self._contexts[world]
         q, v = self.plant.GetPositions(context), self.plant.GetVelocities(context)
         for obj in self._free:

@@ -113,14 +113,20 @@ def _place(scene: Scene, name: str) -> tuple[int, int]:
     return scene.object_qpos(name).start, scene.object_qvel(name).start
 
 
+def _axes(quat: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation matrix of a unit quaternion."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)
+
+
 def _numbers(surface: Surface, law: BallLaw) -> np.ndarray:
     """(SURFACE_NUMBERS,) of a surface."""
     own, tool = np.zeros(SURFACE_NUMBERS), surface.link is not None
-    axes = np.empty(9)
-    mujoco.mju_quat2Mat(axes, np.array(surface.quat) / np.linalg.norm(surface.quat))
+    axes = _axes(np.array(surface.quat) / np.linalg.norm(surface.quat))
     own[KIND], own[BALL_RADIUS] = _KINDS[surface.kind], law.radius
     own[CENTER : CENTER + 3] = surface.center
-    own[AXES : AXES + 9] = axes.reshape(3, 3).T.ravel()
+    own[AXES : AXES + 9] = axes.T.ravel()
     own[SIZE : SIZE + len(surface.size)] = surface.size
     usual = law.tool_restitution if tool else law.ground_restitution
     own[RESTITUTION] = usual if surface.restitution is None else surface.restitution
@@ -140,9 +146,8 @@ def _numbers(surface: Surface, law: BallLaw) -> np.ndarray:
 
 def _tool(model: mujoco.MjModel, link: str) -> np.ndarray:
     """(TOOL_NUMBERS,) of a link."""
-    body, axes = model.body(link).id, np.empty(9)
-    mujoco.mju_quat2Mat(axes, model.body_iquat[body])
-    turn = axes.reshape(3, 3)
+    body = model.body(link).id
+    turn = _axes(model.body_iquat[body])
     inverse = turn @ np.diag(1.0 / model.body_inertia[body]) @ turn.T
     own = np.zeros(TOOL_NUMBERS)
     own[TOOL_MASS] = model.body_mass[body]
@@ -156,9 +161,8 @@ def _top(model: mujoco.MjModel, dragged: SceneObject) -> tuple[float, ...]:
     """A row of ``Game.drags``. Raises ValueError for an object that is not symmetric about its x
     axis."""
     assert dragged.drag is not None
-    body, axes = model.body(dragged.name).id, np.empty(9)
-    mujoco.mju_quat2Mat(axes, model.body_iquat[body])
-    turn = axes.reshape(3, 3)
+    body = model.body(dragged.name).id
+    turn = _axes(model.body_iquat[body])
     inertia = turn @ np.diag(model.body_inertia[body]) @ turn.T
     axial, across = inertia[0, 0], inertia[1, 1]
     if not np.allclose(inertia, np.diag([axial, across, across]), atol=1e-6 * across) or any(

@@ -111,6 +111,7 @@ def test_a_search_gives_the_throw_of_its_middle_and_goes_on_from_it(numbers, tmp
     assert [(done, kept) for done, _, kept in told] == [(1, True), (2, True)]
     assert told[0][1] < 0.0
     assert clip.meta["achieved"]["success"] == 1.0
+    assert len(clip.meta["numbers"]) == len(UNITS)
     again = search("paper", numbers, settings, threads=1)
     assert again.meta["numbers"] == clip.meta["numbers"]
     near, out = tmp_path / "near.npz", tmp_path / "out.npz"
@@ -124,6 +125,7 @@ def test_a_search_gives_the_throw_of_its_middle_and_goes_on_from_it(numbers, tmp
 
 def test_a_clip_of_something_else_is_refused(tmp_path, capsys):
     other = SHIPPED.parents[1] / "free_throw_1.2m_human.npz"
-    assert main(["--near", str(other), "--out", str(tmp_path / "x.npz")]) == 2
-    assert "not a clip of this command" in capsys.readouterr().err
+    for near, words in ((other, "not a clip of this command"), (tmp_path / "none.npz", "none.npz")):
+        assert main(["--near", str(near), "--out", str(tmp_path / "x.npz")]) == 2
+        assert words in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
