@@ -41,7 +41,9 @@ FIRST_X, GAP = 13.72, 9.14
 FINISH_X = 110.0
 GOAL = (FINISH_X, 0.0, 1.0)
 RACE_HEIGHT = 1.067
-LANE_HALF_WIDTH = 0.8
+LANE_HALF_WIDTH, MIDDLE = 0.8, 0.15
+"""How far off the middle of the lane the root may be (m), and how far off it still is the middle
+for the option ``lane``."""
 HALF_THICKNESS, HALF_WIDTH = 0.025, 1.0
 """Of a hurdle along x and y (m)."""
 HALF_DEPTH = 0.65
@@ -120,6 +122,11 @@ class Hurdling:
     to rising ``CLEARANCE`` above it with its root than ever before at this one; 0 for none. A
     runner steps over hurdles of half a metre by lifting its knees a little more; one who does that
     at 0.6 m trips all the same, and nothing tells it to leap."""
+    lane: float = 0.0
+    """Charged in each control step for each metre by which the root is more than ``MIDDLE`` off the
+    middle of the lane; 0 for nothing, as in the paper. A policy that nobody charges runs along the
+    lane's edge in MuJoCo and over it in Drake: all of 8 races there ended so, and none with a fall
+    (PPO, 314 M samples in varied worlds)."""
     finish_ends: bool = False
     """End the episode at the finish. Nothing is paid beyond it: training is spared idle steps. The
     paper's distance needs the whole 600."""
@@ -132,6 +139,8 @@ class Hurdling:
             raise ValueError(f"heights fall by 0 m or more, not {self.lower}")
         if self.leap < 0.0:
             raise ValueError(f"the reward for leaping must not be negative: {self.leap}")
+        if self.lane < 0.0:
+            raise ValueError(f"the charge for leaving the middle must not be negative: {self.lane}")
         if not 0.0 <= self.least < 1.0:
             raise ValueError(f"the least share of h_max must lie in [0, 1), not {self.least}")
         if not 0.0 <= self.landing < GAP:
@@ -316,6 +325,8 @@ def advance(view: View, memory: Memory) -> Advance:
         stood, tops = memory["marks"][:, :HURDLES], _tops(view)
         knocked = (tops[..., 2] < heights - KNOCKED).sum(-1).float()
         heights = heights.masked_fill(length(tops - stood) > MOVED, 0.0)
+    if view.config.lane > 0.0:
+        terms["lane"] = -view.config.lane * (y.abs() - MIDDLE).clamp(min=0.0)
 
     # The links that pass a hurdle's plane, and how high they do, interpolated within the step.
     links, before = view.physics.body_pos[:, 0], memory["links"]

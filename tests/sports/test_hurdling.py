@@ -89,6 +89,20 @@ def test_a_leap_before_a_hurdle_is_paid_once_and_as_far_as_it_is_needed():
         Hurdling(leap=-1.0)
 
 
+def test_the_middle_of_the_lane_is_free_and_its_sides_are_charged_alike():
+    def charged(y: float) -> float:
+        world = at(10.0, lane=0.5)
+        world.place((10.2, y, STANDING))
+        return float(world.advance().terms["lane"][0, 0])
+
+    assert [charged(y) for y in (0.0, 0.15, -0.15)] == pytest.approx([0.0] * 3, abs=1e-6)
+    assert [charged(y) for y in (0.25, -0.25)] == pytest.approx([-0.05] * 2, abs=1e-6)
+    assert charged(-0.75) == pytest.approx(-0.3, abs=1e-6)
+    assert "lane" not in at(10.0).advance().terms
+    with pytest.raises(ValueError, match="middle"):
+        Hurdling(lane=-0.1)
+
+
 def test_progress_is_paid_once():
     world = at(10.0)
     goal = (110.0, 0.0, 1.0)
