@@ -16,16 +16,20 @@ same whether the throw will count or not.
 By the technical rules a throw goes over the shoulder or the upper part of the throwing arm and is
 not slung. The paper does not ask how, and a search that was not asked slung it past the hip. So a
 throw counts only if the hand was at the shoulder's height or above for the last 0.2 s before the
-release (``over_arm``); ``sling`` asks no more than the paper does. The same rules want the tip to
-land first: ``tip_first`` is a metric of the throws that count, as the paper has it. They also want
-it to land in a sector of 29 degrees; that is not asked here.
+release (``over_arm``), and if it came down in the sector: between the lines which the rules draw
+from 8 m behind their arc through the ends of it, here the points where the foul line meets the
+sides of a runway 4 m wide (``in_sector``). ``sling`` and ``anywhere`` ask no more than the paper
+does. The same rules want the tip to land first: ``tip_first`` is a metric of the throws that count,
+as the paper has it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,6 +54,9 @@ LINE_X, HALF_FIELD = 2.0, 2.0
 """Foul line, and how far from the start the root may be along x and y (m)."""
 HOLD_STEPS, THROW_STEPS, RELEASE_STEPS = 18, 36, 48
 """Control steps (0.6, 1.2, 1.6 s): the javelin is held; is thrown; must have left the hand."""
+ARC = 8.0
+"""Radius of the arc of the rules (m), from whose centre the sector opens: 29 degrees with a runway
+4 m wide."""
 REACH = 0.15
 """Palm to grip (m) beyond which the grip is lost; palm to shaft beyond which it is let go."""
 MAX_TILT = 0.5
@@ -69,6 +76,8 @@ AIM = (math.cos(NOSE_UP), 0.0, math.sin(NOSE_UP))
 # Weights of grab, start, goal and attitude while it is held, while it is thrown, and later.
 _WEIGHTS = (0.9, 0.0, 0.0, 0.1, -0.05, 0.05, 0.9, 0.0, 0.0, 0.0, 0.9, 0.1)
 
+_Array = TypeVar("_Array", Tensor, np.ndarray, float)
+
 
 @dataclass(frozen=True)
 class Javelin:
@@ -86,6 +95,8 @@ class Javelin:
     without that noise never does."""
     sling: bool = False
     """Whether a slung throw counts, as it does in the paper."""
+    anywhere: bool = False
+    """Whether a throw counts that came down outside the sector, as it does in the paper."""
 
     def __post_init__(self) -> None:
         if not THROW_STEPS < self.deadline <= RELEASE_STEPS:
@@ -207,7 +218,7 @@ def advance(view: View, memory: Memory) -> Advance:
     failed = lost | clinging | foul | fell
 
     before = memory["ends"], memory["speeds"], memory["fall"]
-    mark, nose_first = _landing(*before, view.control_timestep)
+    mark, aside, nose_first = _landing(*before, view.control_timestep)
     distance = mark - LINE_X
     # What the hand still held when it came down was no throw: the release was seen before.
     thrown = landed & memory["released"] & ~failed & (distance > 0)
@@ -215,11 +226,13 @@ def advance(view: View, memory: Memory) -> Advance:
     heights = torch.cat((memory["hand_heights"][:, 1:], _height(view, hand)[:, None]), dim=1)
     heights = torch.where(memory["released"][:, None], memory["hand_heights"], heights)
     over_arm = (heights >= -LOW_HAND).all(-1)
-    success = thrown if view.config.sling else thrown & over_arm
+    in_sector = aside.abs() <= half_sector(distance)
+    success = thrown & (over_arm | view.config.sling) & (in_sector | view.config.anywhere)
     metrics = nan_where(~success, torch.stack((distance, nose_first.float(), speed)))
     metrics = dict(zip(("distance", "tip_first", "release_speed"), metrics))
     metrics |= {
         "over_arm": nan_where(~thrown, over_arm.float()),
+        "in_sector": nan_where(~thrown, in_sector.float()),
         "success": success.float(),
         "foul": foul.float(),
     }
@@ -296,22 +309,30 @@ def _fall(view: View, nose: Tensor) -> Tensor:
     return constant((0.0, 0.0, -GRAVITY), nose.device) - drag
 
 
-def _landing(ends: Tensor, speeds: Tensor, fall: Tensor, timestep: float) -> tuple[Tensor, Tensor]:
-    """(N,) x where the javelin meets the ground within a control step that began so, and whether
-    the nose comes first. The ends (N, 2, 3) fly on their parabolas of acceleration ``fall`` (N, 3):
-    at 25 m/s a control step is 0.8 m long, and where the javelin is after it has bounced or slid
-    says little."""
-    x, _, z = ends.unbind(-1)
-    forward, _, up = speeds.unbind(-1)
-    ahead, _, rise = fall[:, None].unbind(-1)
+def half_sector(distance: _Array) -> _Array:
+    """How far from the middle (m) a throw of that distance (m) may come down: between the lines
+    from the arc's centre through the points 2 m to the left and right on the foul line."""
+    return HALF_FIELD + distance * (HALF_FIELD / math.sqrt(ARC**2 - HALF_FIELD**2))
+
+
+def _landing(
+    ends: Tensor, speeds: Tensor, fall: Tensor, timestep: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(N,) x and y where the javelin meets the ground within a control step that began so, and
+    whether the nose comes first. The ends (N, 2, 3) fly on their parabolas of acceleration ``fall``
+    (N, 3): at 25 m/s a control step is 0.8 m long, and where the javelin is after it has bounced or
+    slid says little."""
+    z, up, rise = ends[..., 2], speeds[..., 2], fall[:, None, 2]
     drop = (z - JAVELIN_RADIUS).clamp(min=0.0)
     # The smaller root of drop + up t + rise t^2 / 2 = 0, whatever the sign of ``rise``.
     root = (up.square() - 2 * rise * drop).clamp(min=0.0).sqrt()
     time = 2 * drop / (root - up).clamp(min=1e-9)
     first = time.min(dim=1, keepdim=True)
-    time = time.clamp(max=timestep)
-    met = torch.addcmul(x, time, torch.addcmul(forward, time, ahead, value=0.5))
-    return met.gather(1, first.indices)[:, 0], first.indices[:, 0] == 0
+    time = time.clamp(max=timestep)[..., None]
+    way = torch.addcmul(speeds[..., :2], time, fall[:, None, :2], value=0.5)
+    met = torch.addcmul(ends[..., :2], time, way)
+    x, y = met.gather(1, first.indices[..., None].expand(-1, 1, 2))[:, 0].unbind(-1)
+    return x, y, first.indices[:, 0] == 0
 
 
 def _unit(v: Tensor) -> Tensor:
@@ -332,6 +353,7 @@ TASK = Task(
         "distance": "m",
         "tip_first": "fraction",
         "over_arm": "fraction",
+        "in_sector": "fraction",
         "release_speed": "m/s",
         "foul": "fraction",
     },

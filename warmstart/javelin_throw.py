@@ -5,9 +5,9 @@ another stance. Here the task's own athlete throws its own javelin from its own 
 alone. The arm and the trunk draw the javelin back along the line on which it will fly and push it
 along that line (inverse kinematics), with the torques of inverse dynamics, and then the fingers
 open. Numbers change that: see ``BASE`` and ``BUMPED``. :mod:`warmstart.robust_javelin` seeks them,
-for throws that are long by the task's own rules, go over the shoulder and land tip first. Targets
-are held over control steps of 1/30 s as a policy's are, and every frame of the clip is a state
-which MuJoCo reached from the task's own start.
+for throws that are long by the task's own rules, go over the shoulder, stay in the sector and land
+tip first. Targets are held over control steps of 1/30 s as a policy's are, and every frame of the
+clip is a state which MuJoCo reached from the task's own start.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 from sports.env import Env, make_scene
 from sports.humanoid.body import FINGERS, Strength, load_body
 from sports.humanoid.mjcf import body_name, build_model
-from sports.javelin import AIM, DELIVERY, HOLD_STEPS, LOW_HAND, REACH
+from sports.javelin import AIM, DELIVERY, HOLD_STEPS, LOW_HAND, REACH, half_sector
 from sports.javelin import END as TIP
 from sports.physics.base import GRAVITY
 from sports.scene import Scene, humanoid_scene
@@ -87,6 +87,8 @@ OVER_ARM = LOW_HAND - 0.05
 the rules say 0.15."""
 SLUNG = 30.0
 """Cost of a metre below that."""
+ASIDE, WIDE, INSIDE = 0.1, 1.5, 0.5
+"""Cost of a metre to the side, and of one more beyond that share of the sector's half width."""
 EPS = 0.01
 """Step of finite differences (s)."""
 
@@ -175,7 +177,8 @@ class Flown:
 
     def cost(self, strict: float = 1.0) -> np.ndarray:
         """(N,) what is wrong, weighed so, less how far (m); NaN where that is."""
-        return strict * self.wrong - self.far + 0.2 * self.aside
+        wide = np.maximum(self.aside - INSIDE * half_sector(np.maximum(self.far, 0.0)), 0.0)
+        return strict * self.wrong - self.far + ASIDE * self.aside + WIDE * wide
 
 
 class Thrower:
@@ -195,6 +198,9 @@ class Thrower:
         self.knuckles = self._bent(*(f"R_{f}1" for f in FINGERS if f != "Thumb"))
         self.joints = self._bent(*(f"R_{f}{k}" for f in FINGERS if f != "Thumb" for k in (2, 3)))
         self.thumb = self._bent("R_Thumb")
+        model = build_model(self.scene, sensors=False)
+        across = np.sort(model.body_inertia[model.body("javelin").id])
+        self.slim = float(across[0] / across[2])
         self.fingers = np.concatenate([self.knuckles, self.joints, self.thumb])
 
     def _bent(self, *links: str) -> np.ndarray:
@@ -269,11 +275,12 @@ class Thrower:
             along = np.clip((to_palm * nose).sum(1), -TIP, TIP)[:, None]
             released |= np.linalg.norm(to_palm - along * nose, axis=1) > REACH
         velocity, step = speed[:, :3], scene.control_timestep
+        spinning = rotation.rotate(state[:, 3:7], speed[:, 3:])
+        spin = (spinning * nose).sum(1)[:, None] * nose
+        turn = spinning - spin
+        landing = thrown.fly(state[:, :3], velocity, nose, turn + self.slim * spin)
         push = np.linalg.norm((velocity - before) / step + (0.0, 0.0, GRAVITY), axis=1)
-        turn = np.cross(rotation.rotate(state[:, 3:7], speed[:, 3:]), nose)
-        rise, high = velocity[:, 2], np.maximum(state[:, 2] - 0.3, 0.0)
-        time = (rise + np.sqrt(rise**2 + 2.0 * GRAVITY * high)) / GRAVITY
-        steep = np.arcsin(np.clip(nose[:, 2], -1.0, 1.0)) + turn[:, 2] * time
+        steep = landing.elevation
 
         def over(x: np.ndarray, limit: float) -> np.ndarray:
             return np.maximum(x - limit, 0.0)
@@ -282,10 +289,7 @@ class Thrower:
         wrong += 2.0 * (over(steep, STEEP[1]) + over(-steep, -STEEP[0]))
         wrong += 0.5 * over(np.linalg.norm(turn, axis=1), SPIN)
         wrong += SLUNG * over(-heights.min(1), OVER_ARM)
-        far = np.full(count, np.nan)
-        for i in np.flatnonzero(np.isfinite(speed).all(1)):
-            far[i] = thrown.distance(state[i, :3].copy(), velocity[i].copy(), nose[i])
-        return Flown(far, wrong, np.abs(state[:, 1] + velocity[:, 1] * time))
+        return Flown(landing.far, wrong, np.abs(landing.aside))
 
 
 def size_of(numbers: np.ndarray) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -9,6 +11,9 @@ from sports.hoop import APEX, RING_RADIUS
 from sports.humanoid.hold import JAVELIN, JAVELIN_RADIUS
 from sports.javelin import END, LINE_X
 from sports.physics.base import GRAVITY
+
+FLIGHT_STEP, LONGEST_FLIGHT = 1.0 / 120.0, 960
+"""Time step of a flight (s), and how many of them are followed at most."""
 
 
 def distance(place: np.ndarray, velocity: np.ndarray, nose: np.ndarray, drag: bool = True) -> float:
@@ -44,6 +49,75 @@ def distance(place: np.ndarray, velocity: np.ndarray, nose: np.ndarray, drag: bo
         end = solve_ivp(rate, (0.0, 20.0), start, events=lowest, rtol=1e-9, atol=1e-9).y[:, -1]
     tip = -np.sign(nose[2]) * END * nose
     return float(end[0] + tip[0] - LINE_X)
+
+
+@dataclass(frozen=True)
+class Landing:
+    """Where N javelins come down; all (N,)."""
+
+    far: np.ndarray
+    """Beyond the line (m); NaN where the state was not finite or it flies too long."""
+    aside: np.ndarray
+    """y (m)"""
+    elevation: np.ndarray
+    """Of the nose (rad)."""
+
+
+def fly(place: np.ndarray, velocity: np.ndarray, nose: np.ndarray, turning: np.ndarray) -> Landing:
+    """Where javelins come down that turn in flight, as symmetric tops do: the nose goes about the
+    angular momentum.
+
+    Args:
+        place: (N, 3) their centres (m).
+        velocity: (N, 3) of these (m/s).
+        nose: (N, 3) unit.
+        turning: (N, 3) angular momentum over the moment of inertia across the shaft (rad/s): for a
+            shaft without spin its angular velocity.
+
+    Velocity Verlet at ``FLIGHT_STEP``; gravity and drag are those of :func:`distance`.
+    """
+    assert JAVELIN.drag is not None
+    k_along, k_across = (k / JAVELIN.shapes[0].mass for k in JAVELIN.drag)
+    rate = np.linalg.norm(turning, axis=1, keepdims=True)
+    axis = turning / np.maximum(rate, 1e-9)
+    lengthwise = (nose * axis).sum(1, keepdims=True) * axis
+    first, second = nose - lengthwise, np.cross(axis, nose)
+
+    def pull(v: np.ndarray, n: np.ndarray) -> np.ndarray:
+        along = (v * n).sum(1, keepdims=True) * n
+        across = v - along
+        a = -k_along * np.linalg.norm(along, axis=1, keepdims=True) * along
+        a -= k_across * np.linalg.norm(across, axis=1, keepdims=True) * across
+        return a - (0.0, 0.0, GRAVITY)
+
+    def ends(x: np.ndarray, n: np.ndarray) -> np.ndarray:
+        """(N, 3) the lower end."""
+        low = x - END * np.where(n[:, 2:] > 0.0, 1.0, -1.0) * n
+        return low - (0.0, 0.0, JAVELIN_RADIUS)
+
+    out = np.full((3, len(place)), np.nan)
+    going: np.ndarray = np.isfinite(np.hstack([place, velocity, nose, turning])).all(axis=1)
+    x, v, n = (np.where(going[:, None], a, 0.0) for a in (place, velocity, nose))
+    low = ends(x, n)
+    a = pull(v, n)
+    for k in range(1, LONGEST_FLIGHT):
+        angle = k * FLIGHT_STEP * rate
+        n = np.where(going[:, None], lengthwise + np.cos(angle) * first + np.sin(angle) * second, 0)
+        x = x + FLIGHT_STEP * v + 0.5 * FLIGHT_STEP**2 * a
+        later = pull(v + FLIGHT_STEP * a, n)
+        v, a = v + 0.5 * FLIGHT_STEP * (a + later), later
+        before, low = low, ends(x, n)
+        lands = np.flatnonzero(going & (low[:, 2] <= 0.0))
+        if len(lands):
+            drop = np.maximum(before[lands, 2] - low[lands, 2], 1e-12)
+            share = np.clip(before[lands, 2] / drop, 0.0, 1.0)[:, None]
+            met = before[lands] + share * (low[lands] - before[lands])
+            tip = np.arcsin(np.clip(n[lands, 2], -1.0, 1.0))
+            out[:, lands] = met[:, 0] - LINE_X, met[:, 1], tip
+            going[lands] = False
+            if not going.any():
+                break
+    return Landing(*out)
 
 
 def shot(place: np.ndarray, rim: np.ndarray, apex: float = APEX) -> np.ndarray:

@@ -1,24 +1,19 @@
 """Track and field: runways, pits, mats, the hurdles' lane, the javelin's sector.
 
-Distances and widths are those of the tasks' rules; the sector's angle and arc are those of the
-World Athletics technical rules.
+Distances and widths are those of the tasks' rules.
 """
 
 from __future__ import annotations
 
-import math
-
 from olympics_opt.scenery.paint import PAINT, Mark, across, along, rectangle, slanted
 from sports import hurdling as rules
-from sports.javelin import HALF_FIELD, LINE_X
+from sports.javelin import HALF_FIELD, LINE_X, half_sector
 from sports.scene import Scene
 
 TRACK, SAND, SAND_LINE, MAT, TURF = "#c9806a", "#e6d3a6", "#cdb684", "#7fa3c4", "#a9c99a"
 LINE = 0.05
 """Width of a track's lines (m)."""
 
-ARC_RADIUS, SECTOR_ANGLE = 8.0, math.radians(28.96)
-"""The sector's sides meet this far behind the foul line (m), at this angle (rad)."""
 SECTOR_LENGTH = 100.0
 
 
@@ -67,11 +62,9 @@ def hurdling(scene: Scene) -> list[Mark]:
 
 def javelin(scene: Scene) -> list[Mark]:
     """Runway, foul line, the sector's sides, and a line every ten metres from the foul line."""
-    apex = LINE_X - ARC_RADIUS
-    slope = math.tan(SECTOR_ANGLE / 2)
 
     def half_width(x: float) -> float:
-        return (x - apex) * slope
+        return half_sector(x - LINE_X)
 
     end = LINE_X + SECTOR_LENGTH
     first, last = half_width(LINE_X), half_width(end)

@@ -177,11 +177,12 @@ def test_javelin_sector_of_world_athletics() -> None:
     marks = ground_marks(scene_of("javelin"))
     # The foul line: 0.07 m wide, its far edge counts, 0.75 m beyond the sector's sides.
     foul = [c for c in lines("javelin") if np.allclose((c[:, 0].min(), c[:, 0].max()), (1.93, 2.0))]
-    beyond = 8.0 * math.tan(math.radians(28.96 / 2)) + 0.75
+    beyond = 2.0 + 0.75
     assert len(foul) == 1 and np.abs(foul[0][:, 1]) == pytest.approx([beyond] * 4)
     (sector,) = (m for m in marks if m.color == "#a9c99a")
     x, y = np.array(sector.corners).T
-    angle = 2 * math.atan2(y.max(), x.max() - (2.0 - 8.0))
+    centre = 2.0 - math.sqrt(8.0**2 - 2.0**2)  # of an arc through the runway's sides
+    angle = 2 * math.atan2(y.max(), x.max() - centre)
     assert math.degrees(angle) == pytest.approx(28.96, abs=0.01)
     tens = {m.label: float(np.mean(np.array(m.corners)[:, 0])) for m in marks if " m" in m.label}
     assert tens["10 m"] == pytest.approx(12.0) and tens["90 m"] == pytest.approx(92.0)

@@ -566,3 +566,32 @@ def test_a_hand_that_swings_below_the_shoulder_slings_the_javelin(low, since, ov
     assert step.success[0] == counts and not step.metrics["foul"][0]
     assert bool(step.metrics["distance"].isfinite()[0]) == counts
     assert step.metrics["over_arm"][0] == over
+
+
+@pytest.mark.parametrize("anywhere", [False, True])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize(("degrees", "inside"), [(14.4, True), (14.55, False)])
+def test_the_sector_opens_from_the_centre_of_the_arc(degrees, inside, side, anywhere):
+    """By the angle at the centre of an arc of 8 m whose ends are 4 m apart, on the foul line: up to
+    asin(2 / 8) = 14.48 degrees to either side. The javelin drifts by half a metre in its last
+    control step."""
+    world = Throw(anywhere=anywhere)
+    velocity = (20.0, side * 15.0, -12.0)
+
+    def thrown(y: float):
+        released(world)
+        world.javelin((22.0, y, 0.15), elevation=0.0, velocity=velocity)
+        assert not ended(world.step())
+        world.javelin((22.4, y, 0.1), elevation=0.0, velocity=(1.0, 0.0, 0.5))
+        return world.step(ground=40.0)
+
+    # Both ends come down at once, by (0.15 - radius) m at 12 m/s.
+    time = (0.15 - JAVELIN_RADIUS) / 12.0
+    x = {end: 22.0 + end * HALF + 20.0 * time for end in (-1.0, 1.0)}
+    far = min(x.values(), key=lambda x: abs(x - 2.0 - float(thrown(0.0).metrics["distance"][0])))
+    centre = 2.0 - 8.0 * math.cos(math.asin(2.0 / 8.0))
+    y = (far - centre) * math.tan(math.radians(degrees)) - 15.0 * time
+    step = thrown(side * y)
+    assert step.metrics["distance"].isfinite()[0] == (inside or anywhere)
+    assert step.success[0] == (inside or anywhere) and not step.metrics["foul"][0]
+    assert step.metrics["in_sector"][0] == inside

@@ -1,5 +1,6 @@
 """A javelin throw that must go far with noise, too."""
 
+import math
 from pathlib import Path
 
 import mujoco
@@ -16,6 +17,7 @@ from warmstart.javelin_throw import (
     OVER_ARM,
     UNITS,
     WATCHED,
+    Flown,
     size_of,
     throw,
 )
@@ -50,7 +52,9 @@ def test_without_noise_a_copy_in_the_worlds_of_the_task_is_the_throw_itself(monk
     for row, far in zip(asked, flown.far):
         alone = thrower.fly(worlds, thrower.targets(row, 30)[None], thrower.scene.default_qpos())
         assert alone.far[0] == pytest.approx(far, abs=1e-9)
-    expected = (1.0 + WORST) * (2.0 * flown.wrong - flown.far + 0.2 * flown.aside)
+    free = 0.5 * (2.0 + math.tan(math.asin(2.0 / 8.0)) * np.maximum(flown.far, 0.0))
+    wide = 0.1 * flown.aside + 1.5 * np.maximum(flown.aside - free, 0.0)
+    expected = (1.0 + WORST) * (2.0 * flown.wrong - flown.far + wide)
     got = own.judge(asked, seed=0, strict=2.0)
     np.testing.assert_allclose(got, expected + size_of(asked), rtol=1e-12)
 
@@ -67,6 +71,16 @@ def test_the_shipped_throw_goes_far_with_noise_and_in_firm_hands(crowd, numbers)
     copies = crowd.fly(numbers[None], seed=3)
     assert len(copies) == len(robust_javelin.COPIES)
     assert all(copy.far[0] > 15.0 for copy in copies)
+
+
+def test_from_half_way_to_the_edge_of_the_sector_on_every_metre_aside_costs_more():
+    """At 30 m the sector reaches 2 + 30 tan(asin(2 / 8)) = 9.75 m to either side."""
+    aside = np.array([0.0, 4.0, 4.87, 5.87, 9.0])
+    zero = np.zeros(5)
+    cost = Flown(zero + 30.0, zero, aside).cost()
+    np.testing.assert_allclose(cost[:3], 0.1 * aside[:3] - 30.0, atol=1e-9)
+    np.testing.assert_allclose(np.diff(cost[2:]), [1.6, 1.6 * 3.13], atol=0.01)
+    assert math.isnan(Flown(zero + math.nan, zero, aside).cost()[0])
 
 
 def test_a_slung_throw_costs_what_it_goes_too_far(crowd, numbers, monkeypatch):

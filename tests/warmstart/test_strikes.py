@@ -9,13 +9,16 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from sports import tennis as court
 from sports.ball import BALLS, landing, path
+from sports.env import make_env
 from sports.humanoid.body import load_body
 from sports.humanoid.hold import JAVELIN_RADIUS, load_hold
 from sports.humanoid.mjcf import build_model
 from sports.javelin import END, LINE_X
+from sports.physics import PhysicsState
 from warmstart import rotation, shot, strike, thrown
 from warmstart.certificate import certify, required
 from warmstart.demonstration import name_of, strike_clip
@@ -159,6 +162,59 @@ def test_drag_takes_energy_from_a_javelin_that_flies_along_itself():
     place = np.array([0.0, 0.0, 50.0])
     free = thrown.distance(place, 30.0 * nose, nose, drag=False)
     assert free - 0.05 < thrown.distance(place, 30.0 * nose, nose) < free + 0.05
+
+
+def test_javelins_that_do_not_turn_fly_as_in_the_integration_of_one():
+    rng = np.random.default_rng(4)
+    nose = rng.normal(size=(8, 3)) * (0.3, 0.2, 0.3) + (1.0, 0.0, 0.2)
+    nose /= np.linalg.norm(nose, axis=1, keepdims=True)
+    place = rng.uniform((-1.0, -1.0, 1.5), (1.0, 1.0, 2.5), (8, 3))
+    velocity = rng.uniform((5.0, -4.0, -3.0), (24.0, 4.0, 14.0), (8, 3))
+    expected = [thrown.distance(*row) for row in zip(place, velocity, nose)]
+    assert min(expected) < 6.0 and max(expected) > 20.0
+    landing = thrown.fly(place, velocity, nose, np.zeros((8, 3)))
+    np.testing.assert_allclose(landing.far, expected, atol=5e-3)
+    np.testing.assert_allclose(landing.elevation, np.arcsin(nose[:, 2]), atol=1e-9)
+    velocity[3, 0] = np.nan
+    again = thrown.fly(place, velocity, nose, np.zeros((8, 3)))
+    assert np.isnan(again.far[3]) and np.isfinite(np.delete(again.far, 3)).all()
+
+
+@pytest.mark.parametrize("spin", [0.0, 180.0])
+def test_a_javelin_that_turns_lands_where_the_simulation_says(spin):
+    """Nose up and turning down by 0.5 and to the left by 0.4 rad/s: without a spin the nose goes on
+    so; with one it circles."""
+    env = make_env("javelin", num_worlds=1, training=False, physics_options={"threads": 1})
+    scene, physics = env.physics.scene, env.physics
+    model = build_model(scene)
+    inertia = model.body_inertia[model.body("javelin").id]
+    half = np.radians(15.0)
+    quat = np.array([np.cos(half), 0.0, -np.sin(half), 0.0])
+    place, velocity = np.array([1.0, -0.6, 2.6]), np.array([15.0, 1.0, 9.0])
+    qpos, qvel = physics.qpos.clone(), torch.zeros_like(physics.qvel)
+    own = (spin, 0.5, 0.4)
+    qpos[:, scene.object_qpos("javelin")] = torch.tensor([*place, *quat]).float()
+    qvel[:, scene.object_qvel("javelin")] = torch.tensor([*velocity, *own]).float()
+    physics.reset(torch.ones(1, dtype=torch.bool), PhysicsState(qpos, qvel, physics.mocap_pos))
+    env.view.refresh()
+    env.memory = env.task.begin(env.view, {})
+    env.view.clock[:] = 25
+    for _ in range(100):
+        last = physics.object_pos[0, 0].numpy().copy()
+        result = env.step(torch.zeros(1, 1, env.action_size))
+        if result.ended[0]:
+            break
+    frame = Rotation.from_quat(quat, scalar_first=True)
+    nose = frame.apply((1.0, 0.0, 0.0))
+    momentum = (inertia.min() / inertia.max() * spin, *own[1:])
+    landing = thrown.fly(place[None], velocity[None], nose[None], frame.apply(momentum)[None])
+    assert result.metrics["distance"][0] == pytest.approx(landing.far[0], abs=0.1)
+    assert bool(result.metrics["tip_first"][0]) == (landing.elevation[0] < 0.0)
+    reach = END * np.cos(landing.elevation[0]) + 0.5  # of a control step's way
+    assert abs(landing.aside[0] - last[1]) < reach
+    straight = thrown.fly(place[None], velocity[None], nose[None], np.zeros((1, 3)))
+    assert abs(straight.far[0] - landing.far[0]) > 0.3
+    env.close()
 
 
 def test_the_planned_javelin_lies_in_the_hand_like_the_held_one():
