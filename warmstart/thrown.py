@@ -96,7 +96,8 @@ def fly(place: np.ndarray, velocity: np.ndarray, nose: np.ndarray, turning: np.n
         return low - (0.0, 0.0, JAVELIN_RADIUS)
 
     out = np.full((3, len(place)), np.nan)
-    going: np.ndarray = np.isfinite(np.hstack([place, velocity, nose, turning])).all(axis=1)
+    finite = np.isfinite(np.hstack([place, velocity, nose, turning]))
+    going = np.asarray(finite.all(axis=1))
     x, v, n = (np.where(going[:, None], a, 0.0) for a in (place, velocity, nose))
     low = ends(x, n)
     a = pull(v, n)
