@@ -24,6 +24,7 @@ from sports.humanoid.mjcf import body_name, build_model
 from sports.javelin import AIM, DELIVERY, HOLD_STEPS, LOW_HAND, REACH, half_sector
 from sports.javelin import END as TIP
 from sports.physics.base import GRAVITY
+from sports.physics.game import top
 from sports.scene import Scene, humanoid_scene
 from warmstart import rotation, thrown
 from warmstart.clip import Clip
@@ -97,7 +98,7 @@ class _Line:
     """Poses of trunk and arm with the javelin on the line, by how far along it is."""
 
     def __init__(self, scene: Scene) -> None:
-        model = build_model(scene, sensors=False)
+        self.model = model = build_model(scene, sensors=False)
         data, rest = mujoco.MjData(model), scene.default_qpos()
         body = scene.body
         own = [i for i, d in enumerate(body.dofs) if d.link.startswith((*TRUNK, *ARM))]
@@ -198,9 +199,7 @@ class Thrower:
         self.knuckles = self._bent(*(f"R_{f}1" for f in FINGERS if f != "Thumb"))
         self.joints = self._bent(*(f"R_{f}{k}" for f in FINGERS if f != "Thumb" for k in (2, 3)))
         self.thumb = self._bent("R_Thumb")
-        model = build_model(self.scene, sensors=False)
-        across = np.sort(model.body_inertia[model.body("javelin").id])
-        self.slim = float(across[0] / across[2])
+        self.slim = top(self.line.model, self.scene.free_objects[0])[3]
         self.fingers = np.concatenate([self.knuckles, self.joints, self.thumb])
 
     def _bent(self, *links: str) -> np.ndarray:
@@ -280,12 +279,12 @@ class Thrower:
         turn = spinning - spin
         landing = thrown.fly(state[:, :3], velocity, nose, turn + self.slim * spin)
         push = np.linalg.norm((velocity - before) / step + (0.0, 0.0, GRAVITY), axis=1)
-        steep = landing.elevation
 
         def over(x: np.ndarray, limit: float) -> np.ndarray:
             return np.maximum(x - limit, 0.0)
 
         wrong = 20.0 * over(apart, NEAR) + 5.0 * over(tilt, TILTED) + 0.2 * over(push, 1.0)
+        steep = landing.elevation
         wrong += 2.0 * (over(steep, STEEP[1]) + over(-steep, -STEEP[0]))
         wrong += 0.5 * over(np.linalg.norm(turn, axis=1), SPIN)
         wrong += SLUNG * over(-heights.min(1), OVER_ARM)

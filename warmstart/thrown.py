@@ -16,6 +16,17 @@ FLIGHT_STEP, LONGEST_FLIGHT = 1.0 / 120.0, 960
 """Time step of a flight (s), and how many of them are followed at most."""
 
 
+def _drag(v: np.ndarray, nose: np.ndarray) -> np.ndarray:
+    """(..., 3) deceleration (m/s^2) of a javelin at velocity ``v`` (m/s) that points along
+    ``nose``."""
+    assert JAVELIN.drag is not None
+    k_along, k_across = (k / JAVELIN.shapes[0].mass for k in JAVELIN.drag)
+    along = (v * nose).sum(-1, keepdims=True) * nose
+    across = v - along
+    out = k_along * np.linalg.norm(along, axis=-1, keepdims=True) * along
+    return out + k_across * np.linalg.norm(across, axis=-1, keepdims=True) * across
+
+
 def distance(place: np.ndarray, velocity: np.ndarray, nose: np.ndarray, drag: bool = True) -> float:
     """Where a javelin first meets the ground, beyond the line (m): gravity, drag along and across,
     no turning.
@@ -23,18 +34,10 @@ def distance(place: np.ndarray, velocity: np.ndarray, nose: np.ndarray, drag: bo
     ``place`` (3,) and ``velocity`` (3,) of its centre at the release, ``nose`` (3,) unit; without
     ``drag`` in a vacuum.
     """
-    assert JAVELIN.drag is not None
-    k_along, k_across = (k / JAVELIN.shapes[0].mass for k in JAVELIN.drag)
 
     def rate(_: float, state: np.ndarray) -> np.ndarray:
-        v = state[3:]
-        along = float(v @ nose) * nose
-        across = v - along
-        a = np.array([0.0, 0.0, -GRAVITY])
-        if drag:
-            a -= k_along * np.linalg.norm(along) * along
-            a -= k_across * np.linalg.norm(across) * across
-        return np.concatenate([v, a])
+        v, a = state[3:], np.array([0.0, 0.0, -GRAVITY])
+        return np.concatenate([v, a - _drag(v, nose) if drag else a])
 
     low = END * abs(float(nose[2]))
 
@@ -76,19 +79,16 @@ def fly(place: np.ndarray, velocity: np.ndarray, nose: np.ndarray, turning: np.n
 
     Velocity Verlet at ``FLIGHT_STEP``; gravity and drag are those of :func:`distance`.
     """
-    assert JAVELIN.drag is not None
-    k_along, k_across = (k / JAVELIN.shapes[0].mass for k in JAVELIN.drag)
+    finite = np.isfinite(np.hstack([place, velocity, nose, turning]))
+    going = np.asarray(finite.all(axis=1))
+    x, v, n, turning = (np.where(going[:, None], a, 0.0) for a in (place, velocity, nose, turning))
     rate = np.linalg.norm(turning, axis=1, keepdims=True)
     axis = turning / np.maximum(rate, 1e-9)
-    lengthwise = (nose * axis).sum(1, keepdims=True) * axis
-    first, second = nose - lengthwise, np.cross(axis, nose)
+    lengthwise = (n * axis).sum(1, keepdims=True) * axis
+    first, second = n - lengthwise, np.cross(axis, n)
 
     def pull(v: np.ndarray, n: np.ndarray) -> np.ndarray:
-        along = (v * n).sum(1, keepdims=True) * n
-        across = v - along
-        a = -k_along * np.linalg.norm(along, axis=1, keepdims=True) * along
-        a -= k_across * np.linalg.norm(across, axis=1, keepdims=True) * across
-        return a - (0.0, 0.0, GRAVITY)
+        return -_drag(v, n) - (0.0, 0.0, GRAVITY)
 
     def ends(x: np.ndarray, n: np.ndarray) -> np.ndarray:
         """(N, 3) the lower end."""
@@ -96,14 +96,11 @@ def fly(place: np.ndarray, velocity: np.ndarray, nose: np.ndarray, turning: np.n
         return low - (0.0, 0.0, JAVELIN_RADIUS)
 
     out = np.full((3, len(place)), np.nan)
-    finite = np.isfinite(np.hstack([place, velocity, nose, turning]))
-    going = np.asarray(finite.all(axis=1))
-    x, v, n = (np.where(going[:, None], a, 0.0) for a in (place, velocity, nose))
     low = ends(x, n)
     a = pull(v, n)
     for k in range(1, LONGEST_FLIGHT):
         angle = k * FLIGHT_STEP * rate
-        n = np.where(going[:, None], lengthwise + np.cos(angle) * first + np.sin(angle) * second, 0)
+        n = lengthwise + np.cos(angle) * first + np.sin(angle) * second
         x = x + FLIGHT_STEP * v + 0.5 * FLIGHT_STEP**2 * a
         later = pull(v + FLIGHT_STEP * a, n)
         v, a = v + 0.5 * FLIGHT_STEP * (a + later), later

@@ -97,7 +97,7 @@ def build_game(
         offsets=offsets,
         bodies=_integers(list(zip(numbers, agents)), 2),
         dragged=_integers(found, 3),
-        drags=np.array([_top(model, o) for o in dragged]).reshape(-1, 4),
+        drags=np.array([top(model, o) for o in dragged]).reshape(-1, 4),
         tops=np.zeros((n, len(dragged), 11)),
         wrench=wrench,
         applied=np.zeros((n, scene.num_agents, 6)),
@@ -157,7 +157,7 @@ def _tool(model: mujoco.MjModel, link: str) -> np.ndarray:
     return own
 
 
-def _top(model: mujoco.MjModel, dragged: SceneObject) -> tuple[float, ...]:
+def top(model: mujoco.MjModel, dragged: SceneObject) -> tuple[float, ...]:
     """A row of ``Game.drags``. Raises ValueError for an object that is not symmetric about its x
     axis."""
     assert dragged.drag is not None
