@@ -44,6 +44,8 @@ class BenchConfig:
     """Numbers of worlds; by default 256 and 1024 on mujoco, 8192 on warp, 4 on drake."""
     seconds: float = 30.0
     """Time of measurement for each row; at least three turns are taken."""
+    turn_steps: int = meter.STEPS
+    """Control steps of a turn; fewer for tasks of which a turn takes minutes."""
     training: bool = True
     """Measure training too."""
     seed: int = 0
@@ -63,6 +65,7 @@ def bench(
     seconds: float = 30.0,
     training: bool = True,
     seed: int = 0,
+    turn_steps: int = meter.STEPS,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Measures every task on every engine, prints a table and writes the figures as JSON.
@@ -77,13 +80,14 @@ def bench(
         seconds: time of measurement for each row.
         training: measure training too.
         seed: of actions, starts and networks.
+        turn_steps: control steps of a turn.
         quiet: print nothing.
 
     Returns:
         What the file holds: commit, versions, hardware and ``rows``.
 
     Raises:
-        ValueError: unknown task or engine, or a time that is not positive.
+        ValueError: unknown task or engine, or a time or steps that are not positive.
         RuntimeError: an engine cannot run here.
     """
     from rich.console import Console
@@ -104,7 +108,7 @@ def bench(
         "seed": seed,
         "seconds": seconds,
         "sigma": SIGMA,
-        "steps_per_turn": meter.STEPS,
+        "steps_per_turn": turn_steps,
         "rows": [],
     }
     rows: list[Row] = []
@@ -129,6 +133,7 @@ def bench(
                     seconds=seconds,
                     training=training,
                     seed=seed,
+                    steps=turn_steps,
                     on_turn=show,
                 )
             )
@@ -269,5 +274,6 @@ def main(args: Sequence[str] | None = None) -> int:
         seconds=config.seconds,
         training=config.training,
         seed=config.seed,
+        turn_steps=config.turn_steps,
     )
     return 0

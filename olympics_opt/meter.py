@@ -38,6 +38,9 @@ STEPS = 24
 """Control steps of one measurement: a rollout of the trainer."""
 RELOAD = {"cpu": 1, "cuda": 8}
 """Bare physics is put into the environment's states after so many control steps."""
+WARM_UPS, WARM_UP = 4, 60.0
+"""Turns on a GPU that are not counted, and the time (s) after which no further one begins: athletes
+with fingers that play two by two take minutes for each."""
 SIGMA = PPOConfig().sigma
 
 
@@ -86,8 +89,8 @@ class Meter:
         hyper: PPOConfig | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """``steps``: control steps of one measurement, a multiple of ``RELOAD``; ``clock`` gives
-        seconds, tests pass their own."""
+        """``steps``: control steps of one measurement; ``clock`` gives seconds, tests pass their
+        own."""
         self.env, self.steps, self._clock = env, steps, clock
         generator = torch.Generator(env.device).manual_seed(seed)
         shape = (16, env.num_worlds, env.num_agents, env.action_size)
@@ -251,6 +254,7 @@ def measure(
     seconds: float = 30.0,
     training: bool = True,
     seed: int = 0,
+    steps: int = STEPS,
     on_turn: Callable[[int, float], None] | None = None,
 ) -> Row:
     """Figures of one task on one engine.
@@ -262,21 +266,27 @@ def measure(
         seconds: time of measurement; at least three turns are taken.
         training: measure training too (never on drake).
         seed: of actions, starts and networks.
+        steps: control steps of a turn.
         on_turn: called after each turn with their number and the share of the time used.
 
     Raises:
-        ValueError: unknown task or engine. RuntimeError: the engine cannot run here.
+        ValueError: unknown task or engine, or steps that are not positive.
+        RuntimeError: the engine cannot run here.
     """
+    if steps < 1:
+        raise ValueError(f"a turn takes one control step or more, not {steps}")
     began = time.perf_counter()
     env = make_env(task, engine=engine, num_worlds=worlds, seed=seed)
     try:
-        meter = Meter(env, seed=seed, training=training and engine != "drake")
+        meter = Meter(env, seed=seed, training=training and engine != "drake", steps=steps)
         # First calls compile, allocate and capture.
         parts = [meter.pair]
         if meter.agent is not None:
             parts.append(meter.training)
         cuda = env.device.type == "cuda"
-        for _ in range(4 if cuda else 1):
+        for warm_up in range(WARM_UPS if cuda else 1):
+            if warm_up and time.perf_counter() - began > WARM_UP:
+                break
             for part in parts:
                 part()
         setup = time.perf_counter() - began

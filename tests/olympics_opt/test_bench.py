@@ -136,10 +136,11 @@ def test_file_holds_rows_and_where_they_come_from(
     out = tmp_path / "bench.json"
     status = bench.main(
         ["--out", str(out), "--task", "long_jump", "--worlds", "2", "--seconds", "0.01"]
-        + ["--engine", "mujoco", "--no-training"]
+        + ["--engine", "mujoco", "--no-training", "--turn-steps", "2"]
     )
     assert status == 0
     result = json.loads(out.read_text())
+    assert result["steps_per_turn"] == 2
     assert {"commit", "versions", "hardware", "seed", "rows"} <= set(result)
     (row,) = result["rows"]
     assert row["task"] == "long_jump" and row["worlds"] == 2 and row["training"] is None
@@ -152,6 +153,8 @@ def test_mistakes_get_a_sentence(tmp_path: Path) -> None:
         bench.bench(tmp_path / "b.json", tasks=("swimming",))
     with pytest.raises(ValueError, match="seconds"):
         bench.bench(tmp_path / "b.json", seconds=0)
+    with pytest.raises(ValueError, match="one control step"):
+        bench.bench(tmp_path / "b.json", tasks=("long_jump",), worlds=(1,), turn_steps=0)
     if not torch.cuda.is_available():
         with pytest.raises(RuntimeError, match="GPU"):
             measure("long_jump", "warp", worlds=1)

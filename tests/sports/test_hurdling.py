@@ -266,6 +266,21 @@ def test_a_training_start_is_the_race_from_a_hurdle_on():
     assert torch.equal(step.metrics["hurdles"], 10.0 - first)
 
 
+def test_a_training_start_may_be_off_the_middle_of_the_lane_and_an_evaluation_may_not():
+    options = {"aside": 0.4}
+    env = make_env("hurdling", num_worlds=512, seed=3, options=options)
+    y = env.physics.qpos[:, 1]
+    assert y.abs().max() <= 0.4 and abs(float(y.mean())) < 0.04
+    assert abs(float(y.std()) - 0.8 / 12**0.5) < 0.02  # uniform
+    # The goal is seen where it is from there, to the right of who starts on the left.
+    goal = env.task.features(env.view, env.memory)["finish"][:, 0]
+    assert torch.allclose(goal[:, 1], -y, atol=1e-5)
+    race = make_env("hurdling", num_worlds=16, seed=3, options=options, training=False)
+    assert (race.physics.qpos[:, 1] == 0.0).all()
+    with pytest.raises(ValueError, match="not in the lane"):
+        Hurdling(aside=0.8)
+
+
 def test_evaluation_and_the_ablation_are_the_race():
     for training, options in ((False, {}), (True, {"curriculum": False})):
         env = make_env("hurdling", num_worlds=8, training=training, options=options)
