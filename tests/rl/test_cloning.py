@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from rl.checkpoint import checkpoints, load_checkpoint
-from rl.cloning import Cloning, reference
+from rl.cloning import LATER, Cloning, label_weights, reference
 from rl.ppo import PPO, PPOConfig
 from rl.rollout import collect
 from rl.train import TrainConfig, train
@@ -104,6 +104,25 @@ def test_half_of_the_worlds_are_led_and_all_are_labelled_by_their_clock(env, cli
     torch.testing.assert_close(action[:2], label[:2], atol=1e-4, rtol=0)
     torch.testing.assert_close(action[2:], mean[2:], atol=1e-4, rtol=0)
     assert (label - mean).abs().max() > 0.1
+
+
+def test_labels_after_the_last_event_weigh_less(env, clip):
+    """Release 0.7 s after the start: the steps until 0.8 s count in full, by hand and in a loss."""
+    thrown = replace(clip, meta=clip.meta | {"events": {"start": 0.1, "release": 0.8}})
+    wanted = [1.0] * 25 + [LATER] * 15
+    torch.testing.assert_close(label_weights(thrown, 40), torch.tensor(wanted))
+    started = replace(clip, meta=clip.meta | {"events": {"start": 0.0}})
+    assert (label_weights(started, 40) == 1.0).all()
+    learner = cloning(env, thrown)
+    rollout = learner.agent.new_rollout(env.num_worlds)
+    collect(env, learner, rollout, env.reset(), 0.99)
+    clock = torch.arange(SMALL.steps)[:, None].expand(-1, env.num_worlds)
+    learner._counts[:] = 0.0
+    learner._counts[3] = 1.0  # only these labels are there: the others change nothing
+    again = learner.agent.actor.head.weight.detach().clone()
+    rollout.mean[clock != 3] = 5.0
+    told = float(learner.update(rollout, 0)["clone_error"])
+    assert 0.0 < told < 1.0 and (learner.agent.actor.head.weight != again).any()
 
 
 def test_the_critic_learns_and_the_actor_learns_the_labels_alone(env, clip):
