@@ -1,18 +1,25 @@
 """The javelin's rules on states made by hand, with known answers."""
 
 import math
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from rl.cloning import reference
 from sports import quaternion
 from sports.env import make_env
 from sports.humanoid.hold import JAVELIN_LENGTH, JAVELIN_RADIUS
 from sports.javelin import RELEASE_STEPS
+from sports.javelin import flight as rest_of_flight
 from sports.physics import PhysicsState
 from sports.starts import ELAPSED, Starts
 from tests.sports.hand_made import HandMade
+from warmstart import thrown
+from warmstart.clip import Clip
 
+SHIPPED = Path(__file__).parents[2] / "warmstart" / "data" / "throws" / "javelin_paper.npz"
 STANDING = 0.9483
 """Root height with the soles just above the ground."""
 HALF = JAVELIN_LENGTH / 2 - JAVELIN_RADIUS
@@ -595,3 +602,58 @@ def test_the_sector_opens_from_the_centre_of_the_arc(degrees, inside, side, anyw
     assert step.metrics["distance"].isfinite()[0] == (inside or anywhere)
     assert step.success[0] == (inside or anywhere) and not step.metrics["foul"][0]
     assert step.metrics["in_sector"][0] == inside
+
+
+def test_an_episode_that_ends_with_the_release_earns_what_a_whole_one_does():
+    """The shipped throw played twice: one ends in the air with what the other has when it landed."""
+    clip = Clip.load(SHIPPED)
+    env = make_env("javelin", num_worlds=2, training=False, options={"release_ends": 0.5})
+    actions, paid, ends = reference(clip, env), torch.zeros(2), {}
+    env.reset()
+    for step in range(env.task.max_steps):
+        result = env.step(actions[min(step, len(actions) - 1)].expand(2, 1, -1))
+        paid += torch.tensor([k not in ends for k in range(2)]) * result.reward[:, 0]
+        for k in result.terminated[:, 0].nonzero().flatten().tolist():
+            ends.setdefault(k, (step, {n: float(x[k]) for n, x in result.metrics.items()}))
+        if len(ends) == 2:
+            break
+    (early, told), (late, is_so) = ends[0], ends[1]
+    assert early < 30 < 60 < late
+    assert told["success"] == is_so["success"] == told["tip_first"] == is_so["tip_first"] == 1.0
+    assert is_so["distance"] > 35.0
+    assert told["distance"] == pytest.approx(is_so["distance"], abs=0.6)
+    assert told["release_speed"] == pytest.approx(is_so["release_speed"], rel=1e-3)
+    assert float(paid[0]) == pytest.approx(float(paid[1]), rel=0.02)
+    env.close()
+
+
+def test_the_rest_of_a_flight_is_that_of_turning_tops():
+    """20 throws against the search's flight, written apart from it, in numpy and finer steps."""
+    draw = np.random.default_rng(2)
+    world, rows = Throw(), []
+    for _ in range(20):
+        up, azimuth = draw.uniform(0.2, 0.9), draw.normal(0.0, 0.2)
+        place = (0.0, 0.0, draw.uniform(1.2, 2.2))
+        velocity = draw.uniform(8.0, 24.0) * np.array((math.cos(up), 0.1 * azimuth, math.sin(up)))
+        world.javelin(place, elevation=up + 0.1, velocity=velocity, azimuth=azimuth)
+        spin = draw.normal(0.0, 0.5, 3)
+        nose = np.array((math.cos(azimuth), math.sin(azimuth))) * math.cos(up + 0.1)
+        nose = np.array((*nose, math.sin(up + 0.1)))
+        turn = spin - spin @ nose * nose
+        # MuJoCo has angular velocities in the body's frame.
+        quat = world.state.qpos[0, world.q][3:]
+        spun = torch.tensor(turn + 40.0 * nose, dtype=torch.float32)
+        local = quaternion.rotate(quaternion.conjugate(quat), spun)
+        world.state.qvel[:, world.v][:, 3:] = local
+        world._apply()
+        view = world.env.view
+        told = rest_of_flight(view, torch.tensor(nose[None], dtype=torch.float32), 1 / 30)
+        landing = thrown.fly(*(np.array(v, float)[None] for v in (place, velocity, nose, turn)))
+        rows.append((float(told.x[0]) - 2.0, float(told.y[0]), told.nose_first[0], told.attitude[0]))
+        wanted = (landing.far[0], landing.aside[0])
+        assert rows[-1][:2] == pytest.approx(wanted, abs=0.15)
+        assert bool(told.nose_first[0]) == (landing.elevation[0] < 0.0) or abs(landing.elevation[0]) < 0.05
+        assert 0.0 < float(told.attitude[0]) < 30 * 4.0
+    assert {bool(row[2]) for row in rows} == {False, True} and max(rows)[0] > 15.0
+    with pytest.raises(ValueError, match="share"):
+        Throw(release_ends=1.5)
