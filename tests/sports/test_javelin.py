@@ -605,7 +605,7 @@ def test_the_sector_opens_from_the_centre_of_the_arc(degrees, inside, side, anyw
 
 
 def test_an_episode_that_ends_with_the_release_earns_what_a_whole_one_does():
-    """The shipped throw played twice: one ends in the air with what the other has when it landed."""
+    """The shipped throw played twice: one ends in the air with what the other has once landed."""
     clip = Clip.load(SHIPPED)
     env = make_env("javelin", num_worlds=2, training=False, options={"release_ends": 0.5})
     actions, paid, ends = reference(clip, env), torch.zeros(2), {}
@@ -649,11 +649,11 @@ def test_the_rest_of_a_flight_is_that_of_turning_tops():
         view = world.env.view
         told = rest_of_flight(view, torch.tensor(nose[None], dtype=torch.float32), 1 / 30)
         landing = thrown.fly(*(np.array(v, float)[None] for v in (place, velocity, nose, turn)))
-        rows.append((float(told.x[0]) - 2.0, float(told.y[0]), told.nose_first[0], told.attitude[0]))
-        wanted = (landing.far[0], landing.aside[0])
-        assert rows[-1][:2] == pytest.approx(wanted, abs=0.15)
-        assert bool(told.nose_first[0]) == (landing.elevation[0] < 0.0) or abs(landing.elevation[0]) < 0.05
+        nose_first, elevation = bool(told.nose_first[0]), float(landing.elevation[0])
+        rows.append((float(told.x[0]) - 2.0, float(told.y[0]), nose_first))
+        assert rows[-1][:2] == pytest.approx((landing.far[0], landing.aside[0]), abs=0.15)
+        assert nose_first == (elevation < 0.0) or abs(elevation) < 0.05
         assert 0.0 < float(told.attitude[0]) < 30 * 4.0
-    assert {bool(row[2]) for row in rows} == {False, True} and max(rows)[0] > 15.0
+    assert {row[2] for row in rows} == {False, True} and max(rows)[0] > 15.0
     with pytest.raises(ValueError, match="share"):
         Throw(release_ends=1.5)
