@@ -244,7 +244,8 @@ def _begin_from(
     if policy.layer is not None:
         raise ValueError("--init is a latent policy: give --prior as well")
     assert policy.actor is not None
-    agent.load_policy(policy.actor, policy.mean, policy.std, policy.metadata["obs_count"])
+    count = policy.metadata["obs_count"]
+    agent.load_policy(policy.actor, policy.mean, policy.std, count, seen=~unseen)
     critic = agent.load_critic(policy.extra)
     warmup = 0 if critic else config.hyper.critic_warmup
     return warmup, unseen.to(agent.device) if bool(unseen.any()) else None

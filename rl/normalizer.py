@@ -32,6 +32,7 @@ class Normalizer:
         # One row of count, then D means, then D sums of squared deviations.
         self._total = torch.zeros(1 + 2 * size, dtype=torch.float64, device=device)
         self._pending = torch.zeros_like(self._total)
+        self._kept = torch.zeros(size, dtype=torch.bool, device=device)
         self.mean = torch.zeros(size, device=device)
         """(D,) float32 in use; 0 before the first commit."""
         self.std = torch.ones(size, device=device)
@@ -63,10 +64,27 @@ class Normalizer:
             dist.all_gather(parts, self._pending)
         else:
             parts = [self._pending]
+        before = self._total
         for part in parts:
             self._total = merge(self._total, part)
+        self._hold(before)
         self._pending = torch.zeros_like(self._pending)
         self._refresh()
+
+    def keep(self, columns: Tensor) -> None:
+        """From now on the mean and the deviation of some features (D,) bool, beside those kept
+        already, stay as they are, whatever is committed: what reads them was made for these."""
+        self._kept |= columns.to(self._kept)
+
+    def _hold(self, before: Tensor) -> None:
+        """Gives the features that are kept the moments that they had ``before`` (1 + 2 D,), as if
+        all samples since had been like those."""
+        count, mean, squares = _split(self._total)
+        old_count, old_mean, old_squares = _split(before)
+        grown = old_squares * (count / old_count.clamp(min=1.0))
+        mean = torch.where(self._kept, old_mean, mean)
+        squares = torch.where(self._kept, grown, squares)
+        self._total = torch.cat((count[None], mean, squares))
 
     def adopt(self, columns: Tensor) -> None:
         """Gives some features (D,) bool, of which nothing is known yet, the moments that are now
@@ -95,11 +113,16 @@ class Normalizer:
         return x * self.std + self.mean
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Total and pending moments, each (1 + 2 D,) float64."""
-        return {"total": self._total.clone(), "pending": self._pending.clone()}
+        """Total and pending moments, each (1 + 2 D,) float64, and (D,) bool which features are
+        kept."""
+        state = {"total": self._total, "pending": self._pending, "kept": self._kept}
+        return {name: x.clone() for name, x in state.items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Takes the moments back. Raises ValueError for another number of features."""
+        """Takes the moments back, and which features are kept, where the state says so.
+
+        Raises ValueError for another number of features.
+        """
         if state["total"].shape != self._total.shape:
             raise ValueError(
                 f"normaliser statistics of {(state['total'].numel() - 1) // 2} features do not fit "
@@ -107,6 +130,8 @@ class Normalizer:
             )
         self._total = state["total"].to(self._total)
         self._pending = state["pending"].to(self._total)
+        if "kept" in state:
+            self._kept = state["kept"].to(self._kept)
         self._refresh()
 
     def set_moments(self, count: float, mean: Tensor, std: Tensor) -> None:

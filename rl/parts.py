@@ -129,7 +129,7 @@ class Lesson(Part):
     name, columns = "cloning", (CLONE_ERROR,)
 
     def __init__(self, config: TrainConfig, env: Any, agent: PPO) -> None:
-        clip, self.iterations = Clip.load(config.clips[0]), config.clone
+        clip, self.iterations, self.agent = Clip.load(config.clips[0]), config.clone, agent
         self.cloning = Cloning(
             env, agent, clip, config.clone, config.clone_fingers, config.clone_rates
         )
@@ -140,6 +140,9 @@ class Lesson(Part):
 
     def actor(self, iteration: int) -> Actor | None:
         self.cloning.leading = iteration < self.iterations
+        if iteration == max(self.iterations // 2, 1):
+            # The fine half of the lesson is read as all will be that comes after it.
+            self.agent.keep_statistics(torch.ones_like(self.agent.obs_norm.mean, dtype=torch.bool))
         return self.cloning if self._going_on else None
 
     def learn(self, rollout: Rollout, iteration: int) -> dict[str, Tensor]:

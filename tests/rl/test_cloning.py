@@ -183,6 +183,33 @@ def test_a_run_stopped_while_it_clones_goes_on_bit_for_bit(tmp_path: Path):
         torch.testing.assert_close(parts[name], x, rtol=0, atol=0, equal_nan=True, msg=name)
 
 
+def test_observations_are_read_alike_from_the_half_of_the_cloning_on(tmp_path: Path):
+    """What a cloned actor does hangs on how it sees: PPO's new samples must not move that."""
+
+    def statistics(iterations: int, moving: bool = False) -> torch.Tensor:
+        config = TrainConfig(
+            task="javelin",
+            out=tmp_path / f"{iterations}{moving}",
+            worlds=4,
+            samples=iterations * SMALL.steps * 4,
+            clips=(THROW,),
+            clone=4,
+            ppo=replace(SMALL, moving_statistics=moving),
+            quiet=True,
+            device="cpu",
+            physics_options={"threads": 1},
+        )
+        train(config)
+        total = load_checkpoint(checkpoints(config.out)[-1])[1]["agent/obs_norm.total"]
+        size = (len(total) - 1) // 2
+        return torch.cat((total[1 : 1 + size], total[1 + size :] / total[0]))
+
+    half, end, later = (statistics(n) for n in (2, 4, 6))
+    torch.testing.assert_close(end, half, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(later, half, rtol=1e-9, atol=1e-12)
+    assert not torch.allclose(statistics(1), half) and not torch.allclose(statistics(6, True), half)
+
+
 def test_fingers_go_on_learning_their_labels_while_other_joints_stay(env, clip):
     """After the cloning, without rewards: fingers come nearer to the clip, no other output is
     pulled to it, and nobody plays the clip."""

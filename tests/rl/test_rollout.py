@@ -160,3 +160,32 @@ def test_normaliser_weights_clips_and_round_trips():
     torch.testing.assert_close(third.normalize(x), norm.normalize(x), rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match="3 features"):
         Normalizer(3).load_state_dict(norm.state_dict())
+
+
+def test_features_that_are_kept_stay_as_they_are_and_the_others_follow_the_data():
+    rng = np.random.default_rng(1)
+    first, later = rng.normal(3.0, 2.0, (50, 3)), rng.normal(-70.0, 9.0, (400, 3))
+    norm = Normalizer(3)
+    norm.set_moments(50, torch.tensor(first.mean(0)), torch.tensor(first.std(0)))
+    before = norm.mean.clone(), norm.std.clone()
+    norm.keep(torch.tensor([True, False, False]))
+    norm.keep(torch.tensor([False, False, True]))  # beside those kept already
+    resumed = Normalizer(3)
+    resumed.load_state_dict(norm.state_dict())
+    old = {n: x for n, x in norm.state_dict().items() if n != "kept"}  # a state of before
+    for each in (norm, resumed):
+        for batch in np.split(later, 4):
+            each.collect(torch.tensor(batch))
+            each.commit()
+        both = np.concatenate((first, later))[:, 1]
+        kept = [0, 2]
+        torch.testing.assert_close(each.mean[kept], before[0][kept], rtol=1e-7, atol=0)
+        torch.testing.assert_close(each.std[kept], before[1][kept], rtol=1e-6, atol=0)
+        np.testing.assert_allclose(each.mean[1], both.mean(), rtol=1e-5)
+        np.testing.assert_allclose(each.std[1], both.std(), rtol=1e-3)
+        assert float(each.count) == 450.0
+    plain = Normalizer(3)
+    plain.load_state_dict(old)
+    plain.collect(torch.tensor(later))
+    plain.commit()
+    assert (plain.mean < -50.0).all()

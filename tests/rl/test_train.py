@@ -20,13 +20,13 @@ import rl.checkpoint
 from rl.assembly import default_env
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.config import config_from_dict
-from rl.policy import PolicyError
+from rl.policy import PolicyError, load_policy
 from rl.ppo import PAPER, PPOConfig
 from rl.runlog import read_progress
 from rl.train import TrainConfig, main, parse_args, train
 from sports.env import make_env
 from sports.physics.variation import Variation, draw
-from tests.rl.toy import SMALL, toy_config, toy_env
+from tests.rl.toy import SMALL, Integrator, toy_config, toy_env
 
 ROOT = Path(__file__).parents[2]
 OWN = Variation(own_share=0.5)
@@ -200,6 +200,30 @@ def test_fine_tuning_starts_from_the_policy(tmp_path):
     assert counts[1] == pytest.approx(first.samples + 2 * 1024)
     with pytest.raises(PolicyError, match="task 'toy'"):
         train(TrainConfig(task="long_jump", out=tmp_path / "c", init=str(tmp_path / "a")))
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_an_actor_that_does_not_learn_stays_the_policy_it_began_as(tmp_path, moving):
+    """With rate 0 in a world 3 m away, where observations are others: what it does is what the
+    first policy does, unless the statistics of observations move under it. A resumed run too."""
+    train(toy_config(tmp_path / "a", samples=4 * 1024), environment=toy_env)
+
+    class Elsewhere(Integrator):
+        def _draw(self):
+            return super()._draw() + torch.tensor([3.0, 0.0])
+
+    def elsewhere(config, seed):
+        return Elsewhere(config.num_worlds, seed)
+
+    still = dataclasses.replace(SMALL, learning_rate=0.0, kl_band=None, moving_statistics=moving)
+    config = toy_config(tmp_path / "b", samples=4 * 1024, ppo=still, init=str(tmp_path / "a"))
+    train(config, environment=elsewhere, part=0.5)
+    again = dataclasses.replace(config, resume=True)
+    train(again, environment=elsewhere)
+    obs = torch.tensor([[[0.5, -0.2]], [[-0.9, 0.1]], [[3.0, 0.4]]])
+    first, second = (load_policy(str(tmp_path / n), "toy")(obs) for n in "ab")
+    assert torch.allclose(first, second, rtol=0, atol=1e-6) is not moving
+    assert float(last(tmp_path / "b")["agent/obs_norm.total"][0]) == 8 * 1024
 
 
 def test_command_line():

@@ -179,6 +179,9 @@ def test_a_run_begins_with_it(tmp_path, algo):
         tensors["agent/obs_norm.total"][1:][: len(unseen)],
     )
     assert float(count) == 1000.0 + run.samples  # type: ignore[operator]
+    kept = tensors["agent/obs_norm.kept"]
+    assert torch.equal(kept, ~unseen)
+    torch.testing.assert_close(mean[kept].float(), policy.mean[kept])
     # The opponent is 26 m away, behind the net: the mean of its place is not that of nothing.
     ahead = env.obs_slices["goal/opponent"].start
     assert float(mean[ahead]) > 20.0
