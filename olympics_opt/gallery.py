@@ -46,7 +46,7 @@ def shipped(task: str) -> str:
     """The policy with which a task is shown: the weakest athlete's that is shipped, or ``zero``."""
     from rl.pretrained import available
 
-    have = [f"pretrained:{p['algo']}-{p['strength']}" for p in available() if p["task"] == task]
+    have = [f"pretrained:{p['name']}-{p['strength']}" for p in available() if p["task"] == task]
     return min(have, key=lambda name: not name.endswith("-human")) if have else "zero"
 
 

@@ -85,13 +85,13 @@ def _sources(config: Likeness) -> list[tuple[str, str, str]]:
         if word == "pretrained":
             shipped = [
                 (
-                    f"{p['task']}_{p['algo']}_{p['strength']}",
-                    f"pretrained:{p['algo']}-{p['strength']}",
+                    f"{p['task']}_{p['name']}_{p['strength']}",
+                    f"pretrained:{p['name']}-{p['strength']}",
                     p["task"],
                 )
                 for p in available()
                 if p["task"] in (config.task or task_names())  # the tracker plays no sport
-                and kind in ("", p["algo"], f"{p['algo']}-{p['strength']}")
+                and kind in ("", p["name"], f"{p['name']}-{p['strength']}")
             ]
             if not shipped:
                 raise ValueError(f"no policy '{source}' is shipped for {', '.join(config.task)}")

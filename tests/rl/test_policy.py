@@ -206,6 +206,13 @@ def test_pretrained_are_found_by_algorithm_and_strength(file, tmp_path, monkeypa
     assert pretrained.locate("toy", "ppo-human").stem == "ppo-human"
     assert load_policy("pretrained:ppo-human", "toy").metadata["task"] == "toy"
     refuse("pretrained:amp", r"shipped: pretrained:ppo-human, pretrained:ppo-paper")
+    for suffix in (".safetensors", ".json"):  # one more of an algorithm is found by its own name
+        path = tmp_path / "toy" / f"ppo-paper{suffix}"
+        path.rename(path.with_stem("ppo-varied-paper"))
+    assert [(p["algo"], p["name"]) for p in pretrained.available()][1] == ("ppo", "ppo-varied")
+    assert pretrained.locate("toy", "ppo-varied").stem == "ppo-varied-paper"
+    assert pretrained.locate("toy").stem == "ppo-human"
+    refuse("pretrained:ppo-paper", r"shipped: pretrained:ppo-human, pretrained:ppo-varied-paper")
 
 
 def test_shipped_policies_load_and_are_what_their_names_say():
