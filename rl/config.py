@@ -79,7 +79,8 @@ class TrainConfig:
     then one for Drake, and may fail in evaluations on mujoco without it."""
     init: str | None = None
     """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]; also that of
-    another task with the same body (tennis for tennis_1v1)."""
+    another task with the same body (tennis for tennis_1v1). The statistics of what it observes stay
+    as they are (``--ppo.moving-statistics``)."""
     clips: tuple[Path, ...] = ()
     """Demonstrations (npz): their frames may start episodes, and amp learns their style; for the
     task ``tracking`` the motions to follow: a packed library, or clips and folders of them."""
