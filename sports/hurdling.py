@@ -130,6 +130,11 @@ class Hurdling:
     aside: float = 0.0
     """In training the athlete starts up to this far (m) to either side of the middle of the lane,
     so that every race is a lesson in keeping it."""
+    finish: float = 0.0
+    """Reward at the finish; 0 for none, as in the paper. Progress alone is worth less and less as
+    the race ends, and a fall costs less: the policies in latents lose their races at the last
+    hurdles, where they are fastest, and two per cent of speed are worth seven races of a hundred
+    to them (1.6 M samples of PPO: 18.2 to 18.0 s and 96 to 62 %)."""
     finish_ends: bool = False
     """End the episode at the finish. Nothing is paid beyond it: training is spared idle steps. The
     paper's distance needs the whole 600."""
@@ -144,6 +149,8 @@ class Hurdling:
             raise ValueError(f"the reward for leaping must not be negative: {self.leap}")
         if self.lane < 0.0:
             raise ValueError(f"the charge for leaving the middle must not be negative: {self.lane}")
+        if self.finish < 0.0:
+            raise ValueError(f"the prize at the finish must not be negative: {self.finish}")
         if not 0.0 <= self.aside < LANE_HALF_WIDTH:
             raise ValueError(f"who starts {self.aside} m aside is not in the lane")
         if not 0.0 <= self.least < 1.0:
@@ -351,6 +358,8 @@ def advance(view: View, memory: Memory) -> Advance:
     failed = fell | through | (y.abs() > LANE_HALF_WIDTH)
     arrives = (x > FINISH_X) & ~failed & ~memory["finished"]
     finished = memory["finished"] | arrives
+    if view.config.finish > 0.0:
+        terms["finish"] = view.config.finish * arrives
     was_x = was_along[:, 0]
     ended = failed | finished if view.config.finish_ends else failed
     steps = view.clock - 1 + (FINISH_X - was_x) / (x - was_x)

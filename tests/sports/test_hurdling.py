@@ -119,6 +119,22 @@ def test_progress_is_paid_once():
     assert paid(13.0) == 1.0  # clamped
 
 
+def test_a_prize_for_the_finish_is_paid_once_and_to_nobody_outside_the_lane():
+    def paid(y: float) -> list[float]:
+        world = at(109.7, finish=30.0)
+        steps = []
+        for x in (109.9, 110.2, 110.5):
+            world.place((x, y, STANDING))
+            steps.append(float(world.advance().terms["finish"][0, 0]))
+        return steps
+
+    assert paid(0.0) == [0.0, 30.0, 0.0]
+    assert paid(0.9) == [0.0, 0.0, 0.0]
+    assert "finish" not in at(109.7).advance().terms
+    with pytest.raises(ValueError, match="prize"):
+        Hurdling(finish=-1.0)
+
+
 def test_nothing_is_paid_beyond_the_finish():
     world = at(109.9)
     world.place((110.1, 0.0, STANDING))
