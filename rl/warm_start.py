@@ -3,7 +3,8 @@
 An actor reads slices of an observation with names (``body_pos``, ``goal/ball``, ...). A policy for
 one athlete, against a machine or nobody, becomes one for a contest: the columns of its first layer
 go to the slices of the same names, and those of slices it has never seen, such as the opponent,
-are zero. In the beginning it therefore plays as before, whatever the opponent does. Where actions
+are zero. In the beginning it therefore plays as before, whatever the opponent does. The same goes
+for a task whose options show more than the policy's did. Where actions
 are around another pose, its last layer is made to ask for the same joint angles.
 """
 
@@ -31,19 +32,32 @@ ALIASES: dict[str, tuple[str, ...]] = {
 def load_start(source: str, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
     """A policy to begin training with, and (D,) bool the features that it has never seen.
 
-    A policy of the task itself is returned as it is. One of another task must move the same body
-    with the same actions; its card then says the task and layout of the environment.
+    A policy of the task itself is returned as it is, unless the task's options show more than the
+    policy knows. One of another task must move the same body with the same actions; its card then
+    says the task and layout of the environment.
     Raises PolicyError for a policy that cannot be used.
     """
     policy = read_policy(source, task)
     found = policy.metadata["task"]
     if policy.actor is None:
         raise ValueError(f"--init {source} is a baseline: there is nothing to start from")
-    if found == task:
+    if found == task and not _sees_more(policy, env):
         policy.check(env)
         return policy, torch.zeros(env.obs_size, dtype=torch.bool)
     _same_athlete(policy, env, task, source)
     return _moved(policy, env, task)
+
+
+def _sees_more(policy: Policy, env: Any) -> bool:
+    """Whether the environment shows all that the policy knows by name, and something else."""
+    layout = policy.metadata.get("obs_layout")
+    if not isinstance(layout, dict) or policy.metadata.get("obs_size") == env.obs_size:
+        return False
+    slices = env.obs_slices
+    return all(
+        name in slices and slices[name].stop - slices[name].start == stop - start
+        for name, (start, stop) in layout.items()
+    )
 
 
 def _same_athlete(policy: Policy, env: Any, task: str, source: str) -> None:

@@ -130,6 +130,12 @@ class Hurdling:
     aside: float = 0.0
     """In training the athlete starts up to this far (m) to either side of the middle of the lane,
     so that every race is a lesson in keeping it."""
+    lane_seen: bool = False
+    """The athlete also sees where in its lane it is: how far its root is off the middle, at what
+    speed that grows, and the sine of the angle between its heading and the lane. The paper's
+    observation tells this only as differences of the marks' places, of which the nearest is metres
+    and the finish a hundred metres away, so that half a metre off the middle is a twentieth of a
+    standard deviation."""
     finish: float = 0.0
     """Reward at the finish; 0 for none, as in the paper. Progress alone is worth less and less as
     the race ends, and a fall costs less: the policies in latents lose their races at the last
@@ -320,12 +326,19 @@ def begin(view: View, context: Memory) -> Memory:
 
 
 def features(view: View, memory: Memory) -> dict[str, Tensor]:
-    """Tops of the ten hurdles (30) and finish (3) as seen from the athlete."""
+    """Tops of the ten hurdles (30) and finish (3) as seen from the athlete; with ``lane_seen`` its
+    place in the lane (3): metres off the middle, m/s off it, sine of the heading."""
     marks = memory["marks"]
     if view.config.toppling:
         marks = torch.cat((_tops(view), marks[:, HURDLES:]), dim=1)
     seen = view.heading.local(marks[:, None] - view.root_pos[:, :, None]).flatten(2)
-    return {"hurdles": seen[..., : 3 * HURDLES], "finish": seen[..., 3 * HURDLES :]}
+    parts = {"hurdles": seen[..., : 3 * HURDLES], "finish": seen[..., 3 * HURDLES :]}
+    if view.config.lane_seen:
+        along = view.heading.local(constant((1.0, 0.0, 0.0), marks.device).expand_as(view.root_pos))
+        parts["lane"] = torch.stack(
+            (view.root_pos[..., 1], view.root_linvel[..., 1], -along[..., 1]), dim=-1
+        )
+    return parts
 
 
 def advance(view: View, memory: Memory) -> Advance:

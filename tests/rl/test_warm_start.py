@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -23,11 +24,13 @@ from warmstart.atomic import write_json
 HIDDEN = (8, 8)
 
 
-def policy_file(folder: Path, of: str, **changes: object) -> str:
+def policy_file(
+    folder: Path, of: str, options: dict[str, Any] | None = None, **changes: object
+) -> str:
     """A made-up policy of a task, with statistics of its own, as a file."""
     import hashlib
 
-    env = make_env(of, num_worlds=1)
+    env = make_env(of, num_worlds=1, options=options)
     g = torch.Generator().manual_seed(5)
     actor = MLP(env.obs_size, HIDDEN, env.action_size, "silu", 1.0, g)
     path = folder / f"{of}.safetensors"
@@ -79,6 +82,23 @@ def test_it_acts_as_before_whatever_the_opponent_does(tmp_path, solo, duel, oppo
     other[unseen] += 3.0
     assert torch.equal(policy(other), policy(obs))
     policy.check(env)
+
+
+def test_options_may_show_more_of_the_same_task_but_not_less(tmp_path):
+    plain = make_env("hurdling", num_worlds=1)
+    env = make_env("hurdling", num_worlds=2, seed=1, options={"lane_seen": True})
+    source = policy_file(tmp_path, "hurdling")
+    before, _ = load_start(source, plain, "hurdling")
+    policy, unseen = load_start(source, env, "hurdling")
+    lane = env.obs_slices["goal/lane"]
+    assert unseen.nonzero().flatten().tolist() == list(range(lane.start, lane.stop))
+    obs = env.reset()[0, 0] + 0.1
+    assert (policy(obs) - before(obs[~unseen])).abs().max() < 1e-6
+    with pytest.raises(PolicyError, match=f"obs_size {plain.obs_size}"):
+        before.check(env)  # nobody is judged by what he cannot see
+    sees = policy_file(tmp_path, "hurdling", {"lane_seen": True})
+    with pytest.raises(PolicyError, match=f"obs_size {env.obs_size}"):
+        load_start(sees, plain, "hurdling")
 
 
 def test_other_names_for_the_same_thing(tmp_path):

@@ -42,6 +42,23 @@ def test_hurdles_and_finish_are_seen_from_the_athlete():
     torch.testing.assert_close(seen["finish"].view(3), right, atol=1e-3, rtol=0)
 
 
+def test_the_place_in_the_lane_is_seen_where_it_is_asked_for():
+    def lane(y: float, degrees: float, sideways: float) -> list[float]:
+        world = at(20.0, y=y, height=0.9, lane_seen=True)
+        half = math.radians(degrees) / 2
+        world.state.qpos[:, 3:7] = torch.tensor([math.cos(half), 0.0, 0.0, math.sin(half)])
+        world.state.qvel[:, 1] = sideways
+        world._apply()
+        return world.env.task.features(world.env.view, world.env.memory)["lane"].flatten().tolist()
+
+    assert lane(0.3, 0.0, -0.5) == pytest.approx([0.3, -0.5, 0.0], abs=1e-5)
+    assert lane(-0.2, 30.0, 0.25) == pytest.approx([-0.2, 0.25, 0.5], abs=1e-5)
+    assert lane(0.2, -30.0, -0.25) == pytest.approx([0.2, -0.25, -0.5], abs=1e-5)  # mirrored
+    env = make_env("hurdling", num_worlds=1, options={"lane_seen": True})
+    assert env.obs_size - make_env("hurdling", num_worlds=1).obs_size == 3
+    assert env.obs_slices["goal/lane"].stop == env.obs_size
+
+
 def test_a_landing_pays_the_metres_over_the_hurdle():
     places = [4.0, 6.0, 13.0, 13.7, 14.2, 15.2, 16.1, 16.3, 17.0]  # the hurdle is at 13.72
     world = at(places[0], landing=2.5)
