@@ -72,7 +72,7 @@ class Session:
     ) -> None:
         from olympics_opt.play import athlete
         from rl.evaluate import standing_starts
-        from rl.policy import load_policy
+        from rl.policy import load_policy, seen_options
         from sports.env import make_env
         from sports.starts import START_NOISE
 
@@ -85,7 +85,7 @@ class Session:
             strength=strength,  # type: ignore[arg-type]
             limits=limits,  # type: ignore[arg-type]
             training=False,
-            options=options,
+            options=seen_options(self.policy, task) | (options or {}),
         )
         self.policy.check(self.env)
         self.policy.seed(seed)

@@ -21,7 +21,7 @@ import torch
 from scipy import stats
 
 from rl import provenance
-from rl.policy import Policy, load_policy
+from rl.policy import Policy, load_policy, seen_options
 from rl.recording import Recording
 from rl.trials import Played, Share, play_share, ranked, standing_starts
 from sports.env import make_scene
@@ -91,7 +91,8 @@ def evaluate(
         num_worlds: worlds at once (per process); None for the engine's default.
         strength: torque limits; None for those that the policy was trained with.
         limits: joint limits; likewise.
-        options: the task's options.
+        options: the task's options; those that add to what the policy saw when it learned come
+            from its card.
         physics_options: the engine's options.
         timestep_divisor: 2 for half the time step at the same control rate.
         start_noise: +- joint noise of the standing start (rad).
@@ -111,7 +112,7 @@ def evaluate(
     card = policy.metadata
     strength = strength or str(card.get("strength", "paper"))
     limits = limits or str(card.get("limits", "paper"))
-    options = dict(options or {})
+    options = seen_options(policy, task) | dict(options or {})
     make_scene(  # a mistake is told before any process starts
         task,
         strength=strength,  # type: ignore[arg-type]

@@ -28,6 +28,7 @@ from rl.networks import MLP
 from rl.policy_stack import unstacked
 from rl.prior import LatentPrior, PriorError, find_prior
 from rl.provenance import portable
+from sports.registry import get_task
 from warmstart.atomic import write_bytes, write_text
 
 FORMAT = "olympics-opt policy 1"
@@ -154,6 +155,22 @@ class Policy:
         except (ValueError, TypeError) as error:
             raise PolicyError(f"the policy's latents mean nothing here: {error}") from error
         return self.layer.size
+
+
+def seen_options(policy: Policy, task: str) -> dict[str, Any]:
+    """The task's options without which the policy would not see what it learned from (the task's
+    ``sees``), as its card has them."""
+    config = policy.metadata.get("config")
+    chosen = config.get("options") if isinstance(config, dict) else None
+    if policy.metadata.get("task") != task or not isinstance(chosen, dict):
+        return {}
+    spec = get_task(task)
+    default = spec.config()
+    return {
+        name: chosen[name]
+        for name in spec.sees
+        if name in chosen and chosen[name] != getattr(default, name)
+    }
 
 
 def load_policy(source: str | Path, task: str) -> Policy:

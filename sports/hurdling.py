@@ -494,5 +494,6 @@ TASK = Task(
     },
     main_metric="distance",
     max_steps=600,
+    sees=("lane_seen",),
     summary="Run 110 m over ten hurdles.",
 )

@@ -178,6 +178,7 @@ TASK = Task(
     max_steps=300,
     equipment=("paddle",),
     tools=(rackets.WRIST,),
+    sees=("ball_path",),
     summary="Return balls to targets on the far half of the table.",
 )
 

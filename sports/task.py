@@ -180,6 +180,8 @@ class Task:
     not the body's scale times the action around the scene's offset."""
     age_at_start: bool = True
     """Whether training starts episodes' truncation clocks at random ages."""
+    sees: tuple[str, ...] = ()
+    """Options that add to what is observed: a policy that learned with one is played with it."""
     shown: tuple[str, ...] = ("target", "phases")
     """What recordings keep of a world's memory for pictures, where there is such a thing: where
     the target is, (N, 3) or (N, A, 3) m, and how golf's waves lie, (N, 2) rad."""

@@ -196,6 +196,7 @@ TASK = Task(
     max_steps=600,
     equipment=("racket",),
     tools=(rackets.WRIST,),
+    sees=("ball_path",),
     summary="Return the balls of a machine to targets in the far court.",
 )
 

@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import save_file
 
 from rl.checkpoint import checkpoints, load_checkpoint
+from rl.evaluate import evaluate
 from rl.networks import MLP
 from rl.normalizer import Normalizer
 from rl.policy import FORMAT, PolicyError
@@ -99,6 +100,18 @@ def test_options_may_show_more_of_the_same_task_but_not_less(tmp_path):
     sees = policy_file(tmp_path, "hurdling", {"lane_seen": True})
     with pytest.raises(PolicyError, match=f"obs_size {env.obs_size}"):
         load_start(sees, plain, "hurdling")
+
+
+@pytest.mark.parametrize(("task", "option"), [("hurdling", "lane_seen"), ("tennis", "ball_path")])
+def test_a_policy_is_played_with_what_it_learned_to_look_at(tmp_path, task, option):
+    """Its card tells, not the caller; other options of its training are not taken over."""
+    card = {"config": {"options": {option: True, "finish_ends": True, "reach": 3.0}}}
+    with pytest.raises(PolicyError, match="obs_size"):  # a card that does not tell
+        evaluate(policy_file(tmp_path, task, {option: True}), task, trials=1)
+    sees = policy_file(tmp_path, task, {option: True}, **card)
+    assert evaluate(sees, task, trials=1).result["options"] == {option: True}
+    plain = policy_file(tmp_path, task, config={"options": {option: False}})
+    assert evaluate(plain, task, trials=1).result["options"] == {}
 
 
 def test_other_names_for_the_same_thing(tmp_path):
