@@ -4,8 +4,8 @@ An actor reads slices of an observation with names (``body_pos``, ``goal/ball``,
 one athlete, against a machine or nobody, becomes one for a contest: the columns of its first layer
 go to the slices of the same names, and those of slices it has never seen, such as the opponent,
 are zero. In the beginning it therefore plays as before, whatever the opponent does. The same goes
-for a task whose options show more than the policy's did. Where actions
-are around another pose, its last layer is made to ask for the same joint angles.
+for a task whose options show more than the policy's did. Where actions are around another pose,
+its last layer is made to ask for the same joint angles.
 """
 
 from __future__ import annotations
@@ -45,19 +45,17 @@ def load_start(source: str, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
         policy.check(env)
         return policy, torch.zeros(env.obs_size, dtype=torch.bool)
     _same_athlete(policy, env, task, source)
-    return _moved(policy, env, task)
+    policy, unseen = _moved(policy, env, task)
+    policy.check(env)
+    return policy, unseen
 
 
 def _sees_more(policy: Policy, env: Any) -> bool:
     """Whether the environment shows all that the policy knows by name, and something else."""
-    layout = policy.metadata.get("obs_layout")
-    if not isinstance(layout, dict) or policy.metadata.get("obs_size") == env.obs_size:
-        return False
-    slices = env.obs_slices
-    return all(
-        name in slices and slices[name].stop - slices[name].start == stop - start
-        for name, (start, stop) in layout.items()
-    )
+    layout = policy.metadata.get("obs_layout") or {}
+    known = {name: stop - start for name, (start, stop) in layout.items()}
+    shown = {name: s.stop - s.start for name, s in env.obs_slices.items()}
+    return bool(known) and known.items() < shown.items()
 
 
 def _same_athlete(policy: Policy, env: Any, task: str, source: str) -> None:
@@ -114,4 +112,4 @@ def _moved(policy: Policy, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
     card = {**card, "task": task, "obs_size": env.obs_size, "obs_layout": layout}
     mean = policy.mean[old].masked_fill(new, 0.0)
     std = policy.std[old].masked_fill(new, 1.0)
-    return Policy(actor.requires_grad_(False), mean, std, card), new
+    return Policy(actor.requires_grad_(False), mean, std, card, prior=policy.prior), new

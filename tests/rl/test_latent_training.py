@@ -295,6 +295,11 @@ def test_it_goes_with_a_style_and_an_arm(folder, tmp_path):
     with pytest.raises(ValueError, match="give --prior as well"):
         train(replace(other, prior=None, latent=LatentConfig(), algo="ppo", amp=AMPConfig()))
     train(other)
+    # Also where the task shows more than the policy knew.
+    seeing = replace(other, out=tmp_path / "seeing", options={"ball_path": True})
+    with pytest.raises(PolicyError, match="acts through another latent prior"):
+        train(replace(seeing, latent=LatentConfig(arm_residual=0.2)))
+    train(seeing)
 
 
 def test_an_evaluation_is_stepping_by_hand(folder, tmp_path, monkeypatch):
