@@ -252,6 +252,7 @@ def verify(
             label=run,
         )
         report["results"][run] = played.result
+        report["options"] = played.result["options"]  # with those of the policy's card
         report["samples"][run] = {k: np.asarray(v).tolist() for k, v in played.trials.items()}
         recordings[run] = played.median
     return {**report, **compare(report["results"], report["samples"])}, recordings

@@ -334,10 +334,8 @@ def features(view: View, memory: Memory) -> dict[str, Tensor]:
     seen = view.heading.local(marks[:, None] - view.root_pos[:, :, None]).flatten(2)
     parts = {"hurdles": seen[..., : 3 * HURDLES], "finish": seen[..., 3 * HURDLES :]}
     if view.config.lane_seen:
-        along = view.heading.local(constant((1.0, 0.0, 0.0), marks.device).expand_as(view.root_pos))
-        parts["lane"] = torch.stack(
-            (view.root_pos[..., 1], view.root_linvel[..., 1], -along[..., 1]), dim=-1
-        )
+        aside, drift = view.root_pos[..., 1], view.root_linvel[..., 1]
+        parts["lane"] = torch.stack((aside, drift, view.heading.sin), dim=-1)
     return parts
 
 
