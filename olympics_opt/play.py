@@ -25,12 +25,11 @@ def athlete(
 
     Raises PolicyError for a policy that cannot be used with the task.
     """
-    from rl.policy import load_policy
+    from rl.policy import as_trained, load_policy
     from sports.registry import get_task
 
     get_task(task)
-    card = load_policy(policy, task).metadata
-    return strength or card.get("strength", "paper"), limits or card.get("limits", "paper")
+    return as_trained(load_policy(policy, task), task, strength, limits)[:2]
 
 
 def asked(config: Evaluate | Render | Verify) -> dict[str, Any]:

@@ -70,14 +70,15 @@ class Session:
         limits: str | None = None,
         options: dict[str, Any] | None = None,
     ) -> None:
-        from olympics_opt.play import athlete
         from rl.evaluate import standing_starts
-        from rl.policy import load_policy, seen_options
+        from rl.policy import as_trained, load_policy
         from sports.env import make_env
+        from sports.registry import get_task
         from sports.starts import START_NOISE
 
-        strength, limits = athlete(policy, task, strength, limits)
+        get_task(task)
         self.policy = load_policy(policy, task)
+        strength, limits, options = as_trained(self.policy, task, strength, limits, options)
         self.env = make_env(
             task,
             num_worlds=1,
@@ -85,7 +86,7 @@ class Session:
             strength=strength,  # type: ignore[arg-type]
             limits=limits,  # type: ignore[arg-type]
             training=False,
-            options=seen_options(self.policy, task) | (options or {}),
+            options=options,
         )
         self.policy.check(self.env)
         self.policy.seed(seed)

@@ -21,7 +21,7 @@ import torch
 from scipy import stats
 
 from rl import provenance
-from rl.policy import Policy, load_policy, seen_options
+from rl.policy import Policy, as_trained, load_policy
 from rl.recording import Recording
 from rl.trials import Played, Share, play_share, ranked, standing_starts
 from sports.env import make_scene
@@ -110,9 +110,7 @@ def evaluate(
     if not isinstance(policy, Policy):
         policy = load_policy(policy, task)
     card = policy.metadata
-    strength = strength or str(card.get("strength", "paper"))
-    limits = limits or str(card.get("limits", "paper"))
-    options = seen_options(policy, task) | dict(options or {})
+    strength, limits, options = as_trained(policy, task, strength, limits, options)
     make_scene(  # a mistake is told before any process starts
         task,
         strength=strength,  # type: ignore[arg-type]

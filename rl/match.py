@@ -20,7 +20,15 @@ from torch import Tensor
 from rl import elo, provenance
 from rl.evaluate import DEFAULT_WORLDS, Progress, interval
 from rl.host import one_torch_thread
-from rl.policy import BASELINES, Policy, PolicyError, load_policy, read_policy
+from rl.policy import (
+    BASELINES,
+    Athlete,
+    Policy,
+    PolicyError,
+    as_trained,
+    load_policy,
+    read_policy,
+)
 from sports.env import make_env
 from sports.physics import PhysicsState
 from sports.registry import get_task
@@ -214,7 +222,7 @@ class Setting:
     """None for that of the first policy."""
     limits: str | None = None
     options: dict[str, Any] | None = None
-    """Of the task."""
+    """Of the task; what the first policy must see comes from its card."""
 
 
 def play_match(
@@ -236,7 +244,7 @@ def play_match(
     """
     a, b = (_loaded(source, setting.task) for source in (first, second))
     worlds = setting.worlds or DEFAULT_WORLDS.get(setting.engine, DEFAULT_WORLDS["mujoco"])
-    make, strength, limits = make or maker(setting, a), *_athlete(setting, a)
+    make, played = make or maker(setting, a), _athlete(setting, a)
     games = play_games(a, b, make, setting.trials, setting.seed, worlds, progress)
     return {
         "kind": "match",
@@ -250,9 +258,9 @@ def play_match(
             "policy_sha256": b.metadata["sha256"],
         },
         "engine": setting.engine,
-        "strength": strength,
-        "limits": limits,
-        "options": dict(setting.options or {}),
+        "strength": played.strength,
+        "limits": played.limits,
+        "options": played.options,
         "trials": setting.trials,
         "seed": setting.seed,
         "commit": provenance.commit(),
@@ -285,7 +293,7 @@ def play_ladder(
     tally, matches = np.zeros((size, 3), dtype=int), []
     policies = [_loaded(source, setting.task) for source in sources]
     if setting.strength is None:  # all meet as the same athlete
-        setting = Setting(**{**vars(setting), "strength": _athlete(setting, policies[0])[0]})
+        setting = Setting(**{**vars(setting), "strength": _athlete(setting, policies[0]).strength})
     for k, (i, j) in enumerate(pairs):
 
         def report(done: int, total: int, before: int = k * setting.trials) -> None:
@@ -332,7 +340,7 @@ def play_ladder(
 
 def maker(setting: Setting, first: Policy) -> MakeEnv:
     """Environments of a setting."""
-    strength, limits = _athlete(setting, first)
+    played = _athlete(setting, first)
 
     def make(worlds: int, seed: int) -> Any:
         env = make_env(
@@ -340,10 +348,10 @@ def maker(setting: Setting, first: Policy) -> MakeEnv:
             engine=setting.engine,
             num_worlds=worlds,
             seed=seed,
-            strength=strength,  # type: ignore[arg-type]
-            limits=limits,  # type: ignore[arg-type]
+            strength=played.strength,  # type: ignore[arg-type]
+            limits=played.limits,  # type: ignore[arg-type]
             training=False,
-            options=dict(setting.options or {}),
+            options=played.options,
         )
         env.starts = LooseStarts()  # type: ignore[assignment]
         return env
@@ -351,10 +359,9 @@ def maker(setting: Setting, first: Policy) -> MakeEnv:
     return make
 
 
-def _athlete(setting: Setting, first: Policy) -> tuple[str, str]:
-    card = first.metadata
-    strength = setting.strength or str(card.get("strength", "paper"))
-    return strength, setting.limits or str(card.get("limits", "paper"))
+def _athlete(setting: Setting, first: Policy) -> Athlete:
+    asked = setting.strength, setting.limits, setting.options
+    return as_trained(first, setting.task, *asked)
 
 
 def _loaded(source: str | Path | Policy, task: str) -> Policy:

@@ -12,7 +12,7 @@ import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from safetensors import SafetensorError
@@ -171,6 +171,30 @@ def seen_options(policy: Policy, task: str) -> dict[str, Any]:
         for name in spec.sees
         if name in chosen and chosen[name] != getattr(default, name)
     }
+
+
+class Athlete(NamedTuple):
+    """As whom, and with which options of the task, a policy is played."""
+
+    strength: str
+    limits: str
+    options: dict[str, Any]
+
+
+def as_trained(
+    policy: Policy,
+    task: str,
+    strength: str | None = None,
+    limits: str | None = None,
+    options: dict[str, Any] | None = None,
+) -> Athlete:
+    """The athlete of a policy's card, and ``seen_options``, except for what is asked for."""
+    card = policy.metadata
+    return Athlete(
+        strength or str(card.get("strength", "paper")),
+        limits or str(card.get("limits", "paper")),
+        seen_options(policy, task) | dict(options or {}),
+    )
 
 
 def load_policy(source: str | Path, task: str) -> Policy:

@@ -12,6 +12,7 @@ from safetensors.torch import save_file
 
 from rl.checkpoint import checkpoints, load_checkpoint
 from rl.evaluate import evaluate
+from rl.match import Setting, play_match
 from rl.networks import MLP
 from rl.normalizer import Normalizer
 from rl.policy import FORMAT, PolicyError
@@ -112,6 +113,18 @@ def test_a_policy_is_played_with_what_it_learned_to_look_at(tmp_path, task, opti
     assert evaluate(sees, task, trials=1).result["options"] == {option: True}
     plain = policy_file(tmp_path, task, config={"options": {option: False}})
     assert evaluate(plain, task, trials=1).result["options"] == {}
+
+
+def test_a_match_is_played_with_what_both_learned_to_look_at(tmp_path):
+    task, options = "table_tennis_1v1", {"ball_path": True}
+    sees = policy_file(tmp_path, task, options, config={"options": options})
+    setting = Setting(task, trials=2)
+    assert play_match(sees, "zero", setting)["options"] == options
+    (tmp_path / "plain").mkdir()
+    plain = policy_file(tmp_path / "plain", task)
+    with pytest.raises(PolicyError, match="obs_size"):
+        play_match(sees, plain, setting)
+    assert play_match(plain, "zero", setting)["options"] == {}
 
 
 def test_other_names_for_the_same_thing(tmp_path):

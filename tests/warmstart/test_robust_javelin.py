@@ -11,6 +11,8 @@ from sports.humanoid.mjcf import body_name, build_model
 from warmstart import javelin_throw, robust_javelin
 from warmstart.clip import Clip
 from warmstart.javelin_throw import (
+    ALIGNED,
+    ATTACK,
     BASE,
     BUMPED,
     BUMPS,
@@ -110,6 +112,24 @@ def test_a_slung_throw_costs_what_it_goes_too_far(crowd, numbers, monkeypatch):
     cost = thrower.fly(worlds, ctrl, start).wrong[0]
     monkeypatch.setattr(javelin_throw, "SLUNG", 0.0)
     assert cost - thrower.fly(worlds, ctrl, start).wrong[0] >= 30.0 * low - 1e-6
+
+
+def test_a_nose_off_the_path_costs_what_it_is_off(crowd, numbers, monkeypatch):
+    """By the frame of the throw in which the task saw the release."""
+    thrower = crowd.thrower
+    clip = throw(thrower, numbers)
+    frame = round(clip.meta["events"]["release"] * clip.fps)
+    turned = np.zeros(9)
+    mujoco.mju_quat2Mat(turned, clip.object_qpos[frame].reshape(-1)[3:7])
+    speed = clip.object_qvel[frame].reshape(-1)[:3]
+    off = np.arccos(turned.reshape(3, 3)[:, 0] @ speed / np.linalg.norm(speed))
+    worlds, start = Worlds(thrower.scene, 1, 1), thrower.scene.default_qpos()
+    ctrl = thrower.targets(numbers, WATCHED)[None]
+    cost = thrower.fly(worlds, ctrl, start).wrong[0]
+    monkeypatch.setattr(javelin_throw, "ATTACK", 0.0)
+    charged = cost - thrower.fly(worlds, ctrl, start).wrong[0]
+    assert off > 2 * ALIGNED
+    np.testing.assert_allclose(charged, ATTACK * (off - ALIGNED), rtol=1e-3)
 
 
 def test_a_search_gives_the_throw_of_its_middle_and_goes_on_from_it(numbers, tmp_path, capsys):
