@@ -20,7 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sports.humanoid.body import Body
 from sports.humanoid.mjcf import holds, is_bounce, yields
+from sports.scene import Scene
 
 _RANGES = ("friction", "stiffness", "damping", "contact_time", "contact_damping")
 _RANGES += ("contact_impedance",)
@@ -39,6 +41,11 @@ class Variation:
     """Factor of every servo stiffness."""
     damping: tuple[float, float] = (0.9, 1.1)
     """Factor of every joint damping."""
+    uneven: float = 0.0
+    """Stiffness and damping of the joints of one side are greater by up to this share, those of the
+    other side smaller by as much; 0 for two sides alike. Who runs in such worlds must steer: a
+    policy that learned where both sides are alike runs straight by itself, in other engines to one
+    side (docs/physics.md)."""
     contact_time: tuple[float, float] = (0.006, 0.025)
     """Time constant of the contacts of athletes and ground (s). MuJoCo does not go below two time
     steps."""
@@ -76,6 +83,8 @@ class Variation:
             share = getattr(self, name)
             if not 0.0 <= share <= 1.0:
                 raise ValueError(f"variation: {name} must be in [0, 1], not {share}")
+        if not 0.0 <= self.uneven < 1.0:
+            raise ValueError(f"variation: uneven must be in [0, 1), not {self.uneven}")
         if self.own_stride < 1:
             raise ValueError(f"variation: own_stride must be at least 1, not {self.own_stride}")
 
@@ -97,6 +106,18 @@ class Draw:
     hold_time: np.ndarray
     own: np.ndarray
     """bool, whether it is the task's own, with the model's contacts whatever is drawn above"""
+    side: np.ndarray
+    """share by which gains on the left are greater and on the right smaller"""
+
+    def gains(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        """(N, nu) factors of the servos' stiffness and (N, nv) of the damping."""
+        sides = _sides(scene.body)
+        uneven = 1.0 + self.side[:, None] * sides
+        stiffness = self.stiffness[:, None] * np.tile(uneven, scene.num_agents)
+        damping = np.repeat(self.damping[:, None], scene.nv, axis=1)
+        for agent in range(scene.num_agents):
+            damping[:, scene.agent_qvel(agent)][:, -len(sides) :] *= uneven
+        return stiffness, damping
 
     def timesteps(self, timestep: float, substeps: int) -> list[np.ndarray] | None:
         """(N,) time step of every substep: ``stride`` substeps in one, then none until the next;
@@ -135,7 +156,13 @@ def draw(
     for name in ("friction", "stiffness", "damping"):
         values[name] = np.where(own, 1.0, values[name])
     stride, felt = np.where(own, variation.own_stride, stride), felt & ~own
-    return Draw(**values, stride=stride, felt=felt, own=own)
+    side = np.where(own, 0.0, uniform((-variation.uneven, variation.uneven)))
+    return Draw(**values, stride=stride, felt=felt, own=own, side=side)
+
+
+def _sides(body: Body) -> np.ndarray:
+    """(num_dofs,) 1 for a joint of the left side, -1 of the right, 0 in the middle."""
+    return np.array([{"L": 1.0, "R": -1.0}.get(dof.link.split("_")[0], 0.0) for dof in body.dofs])
 
 
 class Damping(NamedTuple):

@@ -271,12 +271,13 @@ class WarpPhysics:
         m.geom_solref = wp.array(solref.astype(np.float32), dtype=m.geom_solref.dtype)
         m.geom_solimp = wp.array(solimp.astype(np.float32), dtype=m.geom_solimp.dtype)
         gain, bias = rows(model.actuator_gainprm), rows(model.actuator_biasprm)
-        gain[:, :, 0] *= drawn.stiffness[:, None]
-        bias[:, :, 1] *= drawn.stiffness[:, None]
+        stiffness, dampings = drawn.gains(self.scene)
+        gain[:, :, 0] *= stiffness
+        bias[:, :, 1] *= stiffness
         m.actuator_gainprm = wp.array(gain, dtype=m.actuator_gainprm.dtype)
         m.actuator_biasprm = wp.array(bias, dtype=m.actuator_biasprm.dtype)
         damping = rows(model.dof_damping.reshape(model.nv, -1)[:, 0])
-        m.dof_damping = wp.array(damping * drawn.damping[:, None].astype(np.float32), dtype=float)
+        m.dof_damping = wp.array(damping * dampings.astype(np.float32), dtype=float)
         timesteps = drawn.timesteps(self.scene.timestep, self.scene.substeps)
         if timesteps is not None:
             self._timesteps = [wp.array(h.astype(np.float32), dtype=float) for h in timesteps]

@@ -211,10 +211,11 @@ class Worlds:
             ball.friction *= drawn.friction
         softness = contact_softness(*self._softness, drawn)
         expand("geom_solref")[:], expand("geom_solimp")[:] = softness
-        expand("actuator_gainprm")[:, :, 0] *= drawn.stiffness[:, None]
-        expand("actuator_biasprm")[:, :, 1] *= drawn.stiffness[:, None]
+        stiffness, dampings = drawn.gains(self.scene)
+        expand("actuator_gainprm")[:, :, 0] *= stiffness
+        expand("actuator_biasprm")[:, :, 1] *= stiffness
         damping = expand("dof_damping")
-        damping *= drawn.damping.reshape(-1, *[1] * (damping.ndim - 1))
+        damping *= dampings.reshape(*dampings.shape, *[1] * (damping.ndim - 2))
         self._timesteps = drawn.timesteps(self.scene.timestep, self.scene.substeps)
         if self._timesteps is not None:
             self._timestep = expand("opt.timestep")

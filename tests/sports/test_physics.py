@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import sports.physics.mujoco as engine
 from sports.env import make_env, make_scene
 from sports.frames import Heading, proprioception
 from sports.humanoid import load_body
@@ -14,6 +15,7 @@ from sports.humanoid.mjcf import build_model
 from sports.physics import Geometry, PhysicsState, default_state, make_physics
 from sports.physics.variation import Variation, draw
 from sports.scene import Start, humanoid_scene
+from warmstart.clip import Clip
 
 
 def cpu(scene, n, **options):
@@ -311,7 +313,8 @@ def test_a_broken_world_is_counted_reset_and_alone():
 def test_worlds_that_vary_are_the_same_on_both_engines():
     pytest.importorskip("mujoco_warp")
     scene = make_scene("long_jump", timestep_divisor=4)
-    options = {"variation": Variation(own_share=0.3, own_stride=4), "variation_seed": 3}
+    uneven = Variation(own_share=0.3, own_stride=4, uneven=0.2)
+    options = {"variation": uneven, "variation_seed": 3}
     c = cpu(scene, 4, **options)
     w = make_physics("warp", scene, 4, device="cpu", **options)
     plain = cpu(scene, 4)
@@ -383,6 +386,41 @@ def test_a_share_of_the_worlds_that_vary_is_the_task_s_own(divisor):
             Variation(**wrong)
     with pytest.raises(ValueError, match="does not divide"):
         draw(Variation(own_stride=3), n, scene.substeps, 0)
+
+
+def test_uneven_sides_are_a_mirror_image_of_the_other_way_round(monkeypatch):
+    """In the air, with the same targets for both sides: the world whose left side is the stiffer
+    one is what a mirror shows of the world whose right side is, but for the body's own sides. In
+    the task's own worlds both are alike."""
+    scene, n = make_scene("long_jump"), 3
+    one = Variation((1, 1), (1, 1), (1, 1), uneven=0.3)
+    drawn = draw(one, n, scene.substeps, 0)
+    assert (np.abs(drawn.side) <= 0.3).all() and len(set(drawn.side)) == n
+    assert np.array_equal(drawn.felt, draw(Variation(), n, scene.substeps, 0).felt)
+    own = draw(dataclasses.replace(one, own_share=0.5), 64, scene.substeps, 0)
+    assert (own.side[own.own] == 0.0).all() and (own.side[~own.own] != 0.0).all()
+
+    sides = np.array([0.3, -0.3, 0.0])
+    alike = dataclasses.replace(drawn, side=sides, felt=np.zeros(n, dtype=bool))
+    monkeypatch.setattr(engine, "draw", lambda *_: alike)
+    physics = cpu(scene, n, variation=one)
+    state = default_state(scene, n, "cpu")
+    state.qpos[:, 2] += 5.0
+    physics.reset(torch.ones(n, dtype=torch.bool), state)
+    rest = state.qpos.double().numpy()
+    generator = np.random.default_rng(0)
+    for _ in range(6):
+        ctrl = 0.6 * np.tile(generator.standard_normal(scene.nu), (n, 1))
+        seen = Clip(fps=30.0, body="smpl", qpos=rest, qvel=np.zeros((n, scene.nv)), ctrl=ctrl)
+        physics.step(torch.tensor(0.5 * (ctrl + seen.mirrored().ctrl), dtype=torch.float32))
+    qpos = physics.qpos.double().numpy()
+    mirror = Clip(fps=30.0, body="smpl", qpos=qpos, qvel=np.zeros((n, scene.nv))).mirrored().qpos
+    uneven = np.abs(mirror[0] - qpos[0]).max()
+    assert uneven > 0.05
+    assert np.abs(mirror[0] - qpos[1]).max() < 0.2 * uneven
+    assert np.abs(mirror[2] - qpos[2]).max() < 0.2 * uneven
+    with pytest.raises(ValueError, match="uneven must be in"):
+        Variation(uneven=1.0)
 
 
 def test_resets_are_decided_by_the_seed():
