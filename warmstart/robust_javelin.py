@@ -140,6 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--spread", type=float, default=Search.spread)
     parser.add_argument("--strict", type=float, default=Search.strict)
     parser.add_argument("--seed", type=int, default=Search.seed)
+    parser.add_argument("--threads", type=int, default=0, help="0 for all cores")
     options = parser.parse_args(arguments)
     names = ("candidates", "rounds", "spread", "strict", "seed")
     settings = Search(**{name: getattr(options, name) for name in names})
@@ -159,7 +160,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 clip.save(options.out)
                 kept = clip
 
-    clip = search(options.strength, near, settings, progress=progress)
+    threads = options.threads
+    clip = search(options.strength, near, settings, threads=threads, progress=progress)
     if kept is None:
         print(f"no throw: {clip.meta['achieved']}", file=sys.stderr)
         return 1
