@@ -130,6 +130,11 @@ class Hurdling:
     aside: float = 0.0
     """In training the athlete starts up to this far (m) to either side of the middle of the lane,
     so that every race is a lesson in keeping it."""
+    taller: float = 0.0
+    """In training the boards stand up to this much (m) higher than the athlete sees them, each by
+    an amount of its own, so that it learns to leave room. A policy that had cleared every board of
+    MuJoCo by nothing (233 M samples in varied worlds) met those of Drake with pelvis and thighs,
+    3 m/s slower after it, and fell before the next: 9 races of 10."""
     lane_seen: bool = False
     """The athlete also sees where in its lane it is: how far its root is off the middle, at what
     speed that grows, and the sine of the angle between its heading and the lane. The paper's
@@ -157,6 +162,13 @@ class Hurdling:
             raise ValueError(f"the charge for leaving the middle must not be negative: {self.lane}")
         if self.finish < 0.0:
             raise ValueError(f"the prize at the finish must not be negative: {self.finish}")
+        if self.taller < 0.0:
+            raise ValueError(f"boards stand higher than they look, not lower: {self.taller}")
+        highest = MOST_MAX if self.height is None else self.height
+        if highest + self.taller > 2.0 * HALF_DEPTH:
+            raise ValueError(f"boards that stand {self.taller} m higher hang off the ground")
+        if self.taller > 0.0 and self.toppling:
+            raise ValueError("a hurdle that topples is as high as it looks: leave taller out")
         if not 0.0 <= self.aside < LANE_HALF_WIDTH:
             raise ValueError(f"who starts {self.aside} m aside is not in the lane")
         if not 0.0 <= self.least < 1.0:
@@ -289,7 +301,12 @@ def start(
         y = view.physics.scene.object_qpos("hurdle0").start + 1 + 7 * numbers
         state.qpos[:, y] = ASIDE_Y * behind
     else:
-        state.mocap_pos[:, :, 2] = torch.where(heights > 0.0, heights, DOWN_Z)
+        tops = heights
+        if training and config.taller > 0.0:
+            tops = heights + config.taller * torch.rand(
+                n, HURDLES, device=device, generator=generator
+            )
+        state.mocap_pos[:, :, 2] = torch.where(heights > 0.0, tops, DOWN_Z)
     marks = torch.zeros(n, HURDLES + 1, 3, device=device)
     marks[:, :HURDLES, 0] = FIRST_X + GAP * numbers
     marks[:, :HURDLES, 2] = heights

@@ -76,6 +76,16 @@ class WarpPhysics:
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         if felt_damping and variation is None:
             firm_ground(model)
+        drawn = None
+        if variation is not None:
+            drawn = draw(variation, num_worlds, scene.substeps, variation_seed, felt_damping)
+            if drawn.cone.all():
+                model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+            elif drawn.cone.any():
+                raise ValueError(
+                    "on a GPU friction has a round cone in all worlds or in none: give a "
+                    "cone_share of 0, or of 1 with an own_share of 0"
+                )
         holds = any(o.holdable for o in scene.objects)
         model.opt.iterations = iterations or (HOLD_ITERATIONS if holds else ITERATIONS)
         model.opt.ls_iterations = line_search or (HOLD_LINE_SEARCH if holds else LINE_SEARCH)
@@ -99,8 +109,7 @@ class WarpPhysics:
             self.d = mjw.make_data(model, nworld=n, nconmax=contacts, njmax=rows)
             self._timesteps = [self.m.opt.timestep] * scene.substeps
             factor, felt, stride = np.ones(n), np.full(n, felt_damping), np.ones(n)
-            if variation is not None:
-                drawn = draw(variation, n, scene.substeps, variation_seed, felt_damping)
+            if drawn is not None:
                 factor, felt, stride = drawn.friction, drawn.felt, drawn.stride
                 self._vary(drawn)
             self._felt: wp.array | None = None

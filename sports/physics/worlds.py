@@ -216,6 +216,8 @@ class Worlds:
         expand("actuator_biasprm")[:, :, 1] *= stiffness
         damping = expand("dof_damping")
         damping *= dampings.reshape(*dampings.shape, *[1] * (damping.ndim - 2))
+        if drawn.cone.any():
+            expand("opt.cone")[drawn.cone] = int(mujoco.mjtCone.mjCONE_ELLIPTIC)
         self._timesteps = drawn.timesteps(self.scene.timestep, self.scene.substeps)
         if self._timesteps is not None:
             self._timestep = expand("opt.timestep")

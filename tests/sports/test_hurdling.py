@@ -314,6 +314,28 @@ def test_a_training_start_may_be_off_the_middle_of_the_lane_and_an_evaluation_ma
         Hurdling(aside=0.8)
 
 
+def test_boards_may_stand_higher_in_training_than_they_look():
+    """By what the engine has beside what the athlete sees; those that are down stay down."""
+    plain = make_env("hurdling", num_worlds=64, seed=5, training=True, options={"height": 0.9})
+    for training in (True, False):
+        options = {"height": 0.9, "taller": 0.1}
+        env = make_env("hurdling", num_worlds=64, seed=5, training=training, options=options)
+        tops, seen = env.physics.mocap_pos[:, :, 2], env.memory["marks"][:, :-1, 2]
+        up = seen > 0.0
+        more = (tops - seen)[up]
+        if training:
+            assert torch.equal(seen, plain.memory["marks"][:, :-1, 2]) and not up.all()
+            assert (more >= 0.0).all() and (more <= 0.1).all() and more.std() > 0.02
+            assert (tops[~up] < 0.0).all()
+        else:
+            assert up.all() and (more.abs() < 1e-6).all()
+    for wrong, why in (({"taller": -0.1}, "not lower"), ({"taller": 0.2}, "off the ground")):
+        with pytest.raises(ValueError, match=why):
+            Hurdling(**wrong)
+    with pytest.raises(ValueError, match="topples"):
+        Hurdling(taller=0.1, toppling=True)
+
+
 def test_evaluation_and_the_ablation_are_the_race():
     for training, options in ((False, {}), (True, {"curriculum": False})):
         env = make_env("hurdling", num_worlds=8, training=training, options=options)

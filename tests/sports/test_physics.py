@@ -310,10 +310,13 @@ def test_a_broken_world_is_counted_reset_and_alone():
         assert env.step(action).valid.all()
 
 
-def test_worlds_that_vary_are_the_same_on_both_engines():
+@pytest.mark.parametrize("cone", [False, True])
+def test_worlds_that_vary_are_the_same_on_both_engines(cone):
     pytest.importorskip("mujoco_warp")
     scene = make_scene("long_jump", timestep_divisor=4)
     uneven = Variation(own_share=0.3, own_stride=4, uneven=0.2)
+    if cone:
+        uneven = Variation(cone_share=1.0, uneven=0.2)
     options = {"variation": uneven, "variation_seed": 3}
     c = cpu(scene, 4, **options)
     w = make_physics("warp", scene, 4, device="cpu", **options)
@@ -386,6 +389,33 @@ def test_a_share_of_the_worlds_that_vary_is_the_task_s_own(divisor):
             Variation(**wrong)
     with pytest.raises(ValueError, match="does not divide"):
         draw(Variation(own_stride=3), n, scene.substeps, 0)
+
+
+def test_a_share_of_the_worlds_that_vary_has_a_round_cone_of_friction(monkeypatch):
+    """Bit for bit what MuJoCo does whose model says so; on a GPU all of them or none."""
+    scene, n = make_scene("long_jump"), 6
+    plain = Variation((1, 1), (1, 1), (1, 1), cone_share=0.5, felt_share=0.0)
+    drawn = dataclasses.replace(draw(plain, n, scene.substeps, 1), own=np.ones(n, dtype=bool))
+    round_ones = torch.tensor(drawn.cone)
+    assert 0 < drawn.cone.sum() < n
+    assert not draw(Variation(own_share=1.0, cone_share=1.0), n, scene.substeps, 0).cone.any()
+    monkeypatch.setattr(engine, "draw", lambda *_: drawn)
+    varied, pyramids = cpu(scene, n, variation=plain), cpu(scene, n)
+    model = build_model(scene)
+    model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    monkeypatch.setattr(engine, "build_model", lambda _: model)
+    cones = cpu(scene, n)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(8):
+        ctrl = (0.5 * torch.randn(scene.nu, generator=generator)).expand(n, -1)
+        for physics in (varied, pyramids, cones):
+            physics.step(ctrl)
+    assert torch.equal(varied.qpos[round_ones], cones.qpos[round_ones])
+    assert torch.equal(varied.qpos[~round_ones], pyramids.qpos[~round_ones])
+    assert (cones.qpos[0] - pyramids.qpos[0]).abs().max() > 1e-4
+    pytest.importorskip("mujoco_warp")
+    with pytest.raises(ValueError, match="in all worlds or in none"):
+        make_physics("warp", scene, 8, device="cpu", variation=Variation(cone_share=0.5))
 
 
 def test_uneven_sides_are_a_mirror_image_of_the_other_way_round(monkeypatch):
