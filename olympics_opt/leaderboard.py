@@ -13,6 +13,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from olympics_opt.speeds import Measured, read_measured, sections
 from warmstart import atomic
 
 BEGIN, END = "<!-- results -->", "<!-- /results -->"
@@ -70,8 +71,9 @@ def paper_results() -> dict[str, dict[str, dict[str, Any]]]:
     return table
 
 
-def results_page(results: Sequence[Mapping[str, Any]]) -> str:
-    """``results/README.md``: one table a task, ours first, the paper's beneath."""
+def results_page(results: Sequence[Mapping[str, Any]], measured: Measured | None = None) -> str:
+    """``results/README.md``: one table a task, ours first, the paper's beneath; then what ``bench``
+    ``measured``."""
     lines = [
         "# Results",
         "",
@@ -104,6 +106,8 @@ def results_page(results: Sequence[Mapping[str, Any]]) -> str:
             for a, cells in _paper_rows(paper.get(task, {}), metrics)
         ]
         lines += [f"## {task}", "", *_markdown(head, table), ""]
+    for title, text, head, table in sections(measured) if measured else ():
+        lines += [f"## {title}", "", text, "", *_markdown(head, table), ""]
     return "\n".join(lines)
 
 
@@ -157,12 +161,12 @@ def rebuild(results: str | Path = "results", readme: str | Path | None = "README
 
     Returns the files written. Raises ValueError for a broken result or a front page without marks.
     """
-    found = read_results(results)
+    found, measured = read_results(results), read_measured(results)
     front = Path(readme) if readme is not None else None
     updated = None
     if front is not None and front.is_file():
         updated = update_section(front.read_text(), summary_table(found), str(front))
-    written = [atomic.write_text(Path(results) / "README.md", results_page(found))]
+    written = [atomic.write_text(Path(results) / "README.md", results_page(found, measured))]
     if front is not None and updated is not None:
         written.append(atomic.write_text(front, updated))
     return written

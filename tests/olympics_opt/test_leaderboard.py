@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from olympics_opt import leaderboard
+from olympics_opt.bench import bench, soak_all
 
 
 def result(**changes) -> dict:
@@ -112,3 +113,25 @@ def test_our_metrics_have_the_papers_names():
         units = get_task(task).metrics
         for name, row in paper[task].items():
             assert re.fullmatch(re.escape(row["unit"]), units[name]), (task, name)
+
+
+def test_speeds_and_endurance_have_tables(folder: Path):
+    """From what ``bench`` writes, itself on a small task."""
+    bench(folder / "speed.json", engines=["mujoco"], tasks=["long_jump"], worlds=[2], seconds=0.01)
+    soak_all(folder / "soak.json", engines=["mujoco"], tasks=["long_jump"], worlds=[2], steps=20)
+    leaderboard.rebuild(folder, None)
+    page = (folder / "README.md").read_text()
+    speed = json.loads((folder / "speed.json").read_text())["rows"][0]
+    row = next(line for line in page.splitlines() if "[speed.json]" in line)
+    assert "| long_jump | mujoco | 2 | 4 x 1/120 s |" in row
+    assert f"| {100 * speed['environment_share']:.0f} % |" in row
+    row = next(line for line in page.splitlines() if "[soak.json]" in line)
+    assert row.startswith("| long_jump | mujoco | 2 | 20 |")
+    heads = [line for line in page.splitlines() if line.startswith("| task |")]
+    assert len(heads) == 2 and heads[1].count(" | ") == row.count(" | ")
+    (folder / "other.json").write_text(json.dumps({"rows": [{"height": 1.0}]}))
+    leaderboard.rebuild(folder, None)
+    broken = {"rows": [{"task": "long_jump"}], "steps_per_turn": 24}
+    (folder / "speed.json").write_text(json.dumps(broken))
+    with pytest.raises(ValueError, match=r"speed\.json: a row of 'rows' lacks"):
+        leaderboard.rebuild(folder, None)

@@ -1,0 +1,120 @@
+"""Tables of what ``bench`` measured: speed of each task on each engine, and endurance.
+
+They stand in ``results/README.md`` beside the results; every figure comes from a file.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+Rows = list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a folder holds of ``bench``: each row with ``file``, ``hardware`` and ``commit``."""
+
+    speeds: Rows
+    soaks: Rows
+
+
+def read_measured(folder: str | Path) -> Measured:
+    """Every row that ``bench`` and ``bench --soak`` wrote into files of a folder, by task, engine
+    and number of worlds. Raises ValueError naming a row that lacks what a table needs."""
+    speeds, soaks = [], []
+    for path in sorted(Path(folder).glob("*.json")):
+        data = json.loads(path.read_text())
+        if not isinstance(data, dict):
+            continue
+        origin = {name: data.get(name, "") for name in ("commit", "hardware")}
+        for key, found, needed in (
+            ("rows", speeds, "environment"),
+            ("soak", soaks, "steps_per_second"),
+        ):
+            rows = data.get(key)
+            # Files of other kinds have rows, too.
+            if not isinstance(rows, list) or (key == "rows" and "steps_per_turn" not in data):
+                continue
+            for row in rows:
+                if not isinstance(row, dict) or "task" not in row or needed not in row:
+                    raise ValueError(f"{path}: a row of '{key}' lacks its task or '{needed}'")
+                found.append({**origin, **row, "file": path.name})
+
+    def order(row: Mapping[str, Any]) -> tuple[Any, ...]:
+        return row["task"], row["engine"], row["worlds"], row["file"]
+
+    return Measured(sorted(speeds, key=order), sorted(soaks, key=order))
+
+
+SPEED = (
+    "Control steps of all worlds a second, by `olympics-opt bench`. *Physics* is the library's own "
+    "stepping of the same model; on a GPU the environment's has faster pieces (docs/physics.md), "
+    "hence shares above 100 %."
+)
+ENDURANCE = (
+    "Random actions for so many control steps of each world, by `olympics-opt bench --soak`."
+)
+
+
+def sections(measured: Measured) -> list[tuple[str, str, list[str], list[list[str]]]]:
+    """Title, explanation, head and cells of each table that has rows."""
+    out = []
+    if measured.speeds:
+        head = ["task", "engine", "worlds", "time step", "physics /s", "environment /s"]
+        head += ["share", "training /s", "GPU GiB", "hardware", "commit", "file"]
+        out.append(("Speed", SPEED, head, [_speed(row) for row in measured.speeds]))
+    if measured.soaks:
+        head = ["task", "engine", "worlds", "steps", "episodes", "not finite", "diverged"]
+        head += ["overflow", "GPU GiB, then", "steps/s", "hardware", "commit", "file"]
+        out.append(("Endurance", ENDURANCE, head, [_soak(row) for row in measured.soaks]))
+    return out
+
+
+def _speed(row: Mapping[str, Any]) -> list[str]:
+    share = row.get("environment_share")
+    return [
+        *_which(row),
+        f"{row['substeps']} x 1/{1 / row['timestep']:.0f} s",
+        _rate(row["bare_physics"]),
+        _rate(row["environment"]),
+        "–" if share is None else f"{100 * share:.0f} %",
+        _rate(row.get("training")),
+        _gib([row.get("device_memory_gib")]),
+        *_origin(row),
+    ]
+
+
+def _soak(row: Mapping[str, Any]) -> list[str]:
+    return [
+        *_which(row),
+        str(row["steps"]),
+        str(row["episodes"]),
+        str(row["bad_observations"] + row["bad_rewards"]),
+        str(row["nan_worlds"]),
+        str(row["overflow"]),
+        _gib(row.get("device_memory_gib") or [None]),
+        _rate(row["steps_per_second"]),
+        *_origin(row),
+    ]
+
+
+def _which(row: Mapping[str, Any]) -> list[str]:
+    return [row["task"], row["engine"], str(row["worlds"])]
+
+
+def _origin(row: Mapping[str, Any]) -> list[str]:
+    return [row["hardware"], str(row["commit"])[:9], f"[{row['file']}]({row['file']})"]
+
+
+def _rate(value: float | None) -> str:
+    if value is None:
+        return "–"
+    return f"{value / 1000:.1f} k" if value >= 1000 else f"{value:.0f}"
+
+
+def _gib(values: Sequence[float | None]) -> str:
+    return ", ".join("–" if value is None else f"{value:.1f}" for value in values)
