@@ -6,6 +6,7 @@ of the joints, as Drake's do (docs/physics.md).
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -13,6 +14,7 @@ from rl.policy import load_policy
 from sports.env import make_env, make_scene
 from sports.humanoid.body import Strength
 from sports.physics import PhysicsState, make_physics
+from sports.physics.variation import Variation
 
 WORLDS, STEPS, MOMENTS = 24, 4, (40, 55)
 
@@ -50,14 +52,27 @@ def com_velocity(
     engine: str, strength: Strength, state: PhysicsState, targets: Tensor, **options: object
 ) -> Tensor:
     """(M, 3) velocity of the centre of mass after the targets."""
-    scene = make_scene("long_jump", strength=strength)
+    return motion(engine, strength, state, targets, **options)[0]
+
+
+def motion(
+    engine: str,
+    strength: Strength,
+    state: PhysicsState,
+    targets: Tensor,
+    divisor: int = 1,
+    **options: object,
+) -> tuple[Tensor, Tensor]:
+    """(M, 3) velocity of the centre of mass and (M, 3) spin of the pelvis after the targets."""
+    scene = make_scene("long_jump", strength=strength, timestep_divisor=divisor)
     physics = make_physics(engine, scene, len(targets), **options)
     physics.reset(torch.ones(len(targets), dtype=torch.bool), state.clone())
     for k in range(STEPS):
         physics.step(targets[:, k])
     velocity = physics.geometry.center_of_mass(physics, 0)[1].clone()
+    spin = physics.body_angvel[:, 0, 0].clone()
     physics.close()
-    return velocity
+    return velocity, spin
 
 
 def show(name: str, difference: Tensor) -> None:
@@ -87,3 +102,25 @@ def test_so_does_one_at_strength_paper_where_contacts_feel_the_damping():
     assert float(felt.mean(0).abs().max()) < 0.12
     assert float(felt.norm(dim=-1).median()) < 0.25
     assert float(felt.square().mean()) < 0.25 * float(plain.square().mean())
+
+
+@pytest.mark.parametrize("cone", [0.0, 1.0])
+def test_firm_ground_that_is_felt_at_a_finer_step_is_a_stand_in_for_drake(cone):
+    """The worlds of docs/physics.md in which a runner learns to run in Drake."""
+    state, targets = sprint("paper")
+    one, ground = (
+        (1.0, 1.0),
+        {"felt_contact_time": (0.01, 0.01), "felt_contact_damping": (1.0, 1.0)},
+    )
+    ground |= {"felt_contact_impedance": (0.9, 0.9)}
+    like = Variation(one, one, one, coarse_share=0.0, felt_share=1.0, cone_share=cone, **ground)
+    drake = motion("drake", "paper", state, targets)
+    off = [
+        [float((a - b).norm(dim=-1).median()) for a, b in zip(found, drake)]
+        for found in (
+            motion("mujoco", "paper", state, targets),
+            motion("mujoco", "paper", state, targets, divisor=4, variation=like),
+        )
+    ]
+    print("as it is", off[0], "stand-in", off[1])
+    assert off[1][0] < 0.15 and off[1][0] < 0.3 * off[0][0] and off[1][1] < 0.3 * off[0][1]
