@@ -314,6 +314,24 @@ def test_a_training_start_may_be_off_the_middle_of_the_lane_and_an_evaluation_ma
         Hurdling(aside=0.8)
 
 
+def test_a_run_up_may_be_longer_or_shorter_in_training():
+    """Than to the hurdle before which the athlete would stand; what counts is from where it is."""
+    options = {"run_up": 0.6}
+    env = make_env("hurdling", num_worlds=512, seed=3, options=options)
+    x, marks = env.physics.qpos[:, 0], env.memory["marks"]
+    plain = make_env("hurdling", num_worlds=512, seed=3)
+    off = x - plain.physics.qpos[:, 0]
+    assert off.abs().max() <= 0.6 and abs(float(off.std()) - 1.2 / 12**0.5) < 0.03
+    assert torch.equal(marks, plain.memory["marks"])
+    assert torch.equal(env.memory["start_x"], x)
+    ahead = env.task.features(env.view, env.memory)["finish"][:, 0, 0]
+    assert torch.allclose(ahead, 110.0 - x, atol=1e-4)
+    race = make_env("hurdling", num_worlds=16, seed=3, options=options, training=False)
+    assert (race.physics.qpos[:, 0] == 0.0).all()
+    with pytest.raises(ValueError, match="run-up may differ"):
+        Hurdling(run_up=5.0)
+
+
 def test_boards_may_stand_higher_in_training_than_they_look():
     """By what the engine has beside what the athlete sees; those that are down stay down."""
     plain = make_env("hurdling", num_worlds=64, seed=5, training=True, options={"height": 0.9})
