@@ -17,6 +17,7 @@ import tyro
 from olympics_opt import meter
 from olympics_opt.meter import SIGMA, Row, measure
 from olympics_opt.soak import STEPS, soak
+from olympics_opt.speeds import rate
 from rl import provenance
 from sports.registry import get_task, task_names
 from warmstart.atomic import write_json
@@ -203,7 +204,7 @@ def soak_all(
                         f"{found.episodes} episodes, {found.nan_worlds} worlds diverged, "
                         f"{found.overflow} overflowed, {found.bad_observations} and "
                         f"{found.bad_rewards} numbers not finite, "
-                        f"{_rate(found.steps_per_second)} steps/s"
+                        f"{rate(found.steps_per_second)} steps/s"
                     )
     return result
 
@@ -237,18 +238,14 @@ def _table(rows: Sequence[Row]) -> Any:
             r.task,
             r.engine,
             str(r.worlds),
-            _rate(r.bare_physics),
-            _rate(r.environment),
+            rate(r.bare_physics),
+            rate(r.environment),
             share(r.environment_share, ENVIRONMENT_SHARE),
-            _rate(r.training) if r.training else "-",
+            rate(r.training) if r.training else "-",
             share(r.training_share, wanted),
             memory,
         )
     return table
-
-
-def _rate(value: float) -> str:
-    return f"{value / 1000:.1f} k" if value >= 1000 else f"{value:.0f}"
 
 
 def main(args: Sequence[str] | None = None) -> int:

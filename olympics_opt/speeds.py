@@ -79,10 +79,10 @@ def _speed(row: Mapping[str, Any]) -> list[str]:
     return [
         *_which(row),
         f"{row['substeps']} x 1/{1 / row['timestep']:.0f} s",
-        _rate(row["bare_physics"]),
-        _rate(row["environment"]),
+        rate(row["bare_physics"]),
+        rate(row["environment"]),
         "–" if share is None else f"{100 * share:.0f} %",
-        _rate(row.get("training")),
+        rate(row.get("training")),
         _gib([row.get("device_memory_gib")]),
         *_origin(row),
     ]
@@ -97,7 +97,7 @@ def _soak(row: Mapping[str, Any]) -> list[str]:
         str(row["nan_worlds"]),
         str(row["overflow"]),
         _gib(row.get("device_memory_gib") or [None]),
-        _rate(row["steps_per_second"]),
+        rate(row["steps_per_second"]),
         *_origin(row),
     ]
 
@@ -110,7 +110,8 @@ def _origin(row: Mapping[str, Any]) -> list[str]:
     return [row["hardware"], str(row["commit"])[:9], f"[{row['file']}]({row['file']})"]
 
 
-def _rate(value: float | None) -> str:
+def rate(value: float | None) -> str:
+    """A number a second, as tables show it."""
     if value is None:
         return "–"
     return f"{value / 1000:.1f} k" if value >= 1000 else f"{value:.0f}"

@@ -300,12 +300,10 @@ def start(
     behind = numbers < first[:, None]
     heights = heights.masked_fill(behind, 0.0)
     state.qpos[:, 0] += GAP * first
-    if training and config.aside > 0.0:
-        share = 2.0 * torch.rand(n, device=device, generator=generator) - 1.0
-        state.qpos[:, 1] += config.aside * share
-    if training and config.run_up > 0.0:
-        share = 2.0 * torch.rand(n, device=device, generator=generator) - 1.0
-        state.qpos[:, 0] += config.run_up * share
+    for axis, most in ((1, config.aside), (0, config.run_up)):
+        if training and most > 0.0:
+            share = 2.0 * torch.rand(n, device=device, generator=generator) - 1.0
+            state.qpos[:, axis] += most * share
     if config.toppling:
         y = view.physics.scene.object_qpos("hurdle0").start + 1 + 7 * numbers
         state.qpos[:, y] = ASIDE_Y * behind

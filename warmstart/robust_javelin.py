@@ -160,8 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 clip.save(options.out)
                 kept = clip
 
-    threads = options.threads
-    clip = search(options.strength, near, settings, threads=threads, progress=progress)
+    clip = search(options.strength, near, settings, threads=options.threads, progress=progress)
     if kept is None:
         print(f"no throw: {clip.meta['achieved']}", file=sys.stderr)
         return 1

@@ -121,7 +121,7 @@ class Draw:
         stiffness = self.stiffness[:, None] * np.tile(uneven, scene.num_agents)
         damping = np.repeat(self.damping[:, None], scene.nv, axis=1)
         for agent in range(scene.num_agents):
-            damping[:, scene.agent_qvel(agent)][:, -len(sides) :] *= uneven
+            damping[:, scene.agent_qvel(agent)][:, 6:] *= uneven
         return stiffness, damping
 
     def timesteps(self, timestep: float, substeps: int) -> list[np.ndarray] | None:

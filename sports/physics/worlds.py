@@ -214,8 +214,8 @@ class Worlds:
         stiffness, dampings = drawn.gains(self.scene)
         expand("actuator_gainprm")[:, :, 0] *= stiffness
         expand("actuator_biasprm")[:, :, 1] *= stiffness
-        damping = expand("dof_damping")
-        damping *= dampings.reshape(*dampings.shape, *[1] * (damping.ndim - 2))
+        damping = expand("dof_damping").reshape(*dampings.shape, -1)
+        damping *= dampings[..., None]
         if drawn.cone.any():
             expand("opt.cone")[drawn.cone] = int(mujoco.mjtCone.mjCONE_ELLIPTIC)
         self._timesteps = drawn.timesteps(self.scene.timestep, self.scene.substeps)
