@@ -60,9 +60,9 @@ THROUGH = 0.10
 # cleared raises it.
 LEAST_MAX, MOST_MAX, RAISE = 0.3, 1.167, 0.15
 RACES = 0.1
-"""Share of training episodes that are the race itself. Without them a policy whose curriculum had
-come to 0.32 m (PPO, 29 M samples: 37 m a race) had never seen a hurdle of 1.067 m: its normalised
-observations lay at their bounds, and it fell over at the start."""
+"""Share of training episodes that are the race itself, where ``races`` leaves it. Without them a
+policy whose curriculum had come to 0.32 m (PPO, 29 M samples: 37 m a race) had never seen a hurdle
+of 1.067 m: its normalised observations lay at their bounds, and it fell over at the start."""
 PROOF = 0.8
 """Share of h_max that the highest hurdle cleared must have had to count."""
 
@@ -100,6 +100,11 @@ class Hurdling:
     curriculum: bool = True
     """In training: heights that grow with success, and starts at any hurdle. False: every episode
     is the race."""
+    races: float = RACES
+    """Share of training episodes that are the race itself; the others start at any hurdle. With 1,
+    as without the curriculum, all worlds run side by side: every update learns from one part of the
+    race and may forget the others. Few races leave the start and the hurdles at full speed to few
+    samples."""
     toppling: bool = False
     """Hurdles are free bodies that fall when hit. Their height is then that of the race or
     ``height`` in training too: a hurdle that stands on the ground cannot be sunk into it."""
@@ -166,6 +171,8 @@ class Hurdling:
             raise ValueError(f"the charge for leaving the middle must not be negative: {self.lane}")
         if self.finish < 0.0:
             raise ValueError(f"the prize at the finish must not be negative: {self.finish}")
+        if not 0.0 <= self.races <= 1.0:
+            raise ValueError(f"the share of whole races must lie in [0, 1], not {self.races}")
         if not 0.0 <= self.run_up < GAP / 2:
             raise ValueError(f"a run-up may differ by 0 m to {GAP / 2} m, not {self.run_up}")
         if self.taller < 0.0:
@@ -283,7 +290,7 @@ def start(
     heights = torch.full((n, HURDLES), _height(config), device=device)
     first = torch.zeros(n, device=device)
     if training and config.curriculum:
-        race = draw[:, 1] < RACES
+        race = draw[:, 1] < config.races
         first = (HURDLES * draw[:, 0]).floor().masked_fill(race, 0.0)
         if curriculum_grows(config):
             share = config.least + (1.0 - config.least) * draw[:, 2:]

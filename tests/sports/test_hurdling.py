@@ -354,6 +354,18 @@ def test_boards_may_stand_higher_in_training_than_they_look():
         Hurdling(taller=0.1, toppling=True)
 
 
+def test_the_share_of_whole_races_is_that_of_the_option():
+    """Whole races start at the line, before the first hurdle; a tenth of the others do too."""
+    for share in (0.1, 0.6, 1.0):
+        options = {"height": RACE_HEIGHT, "races": share}
+        env = make_env("hurdling", num_worlds=400, seed=7, training=True, options=options)
+        at_the_line = (env.physics.qpos[:, 0] == 0.0).double().mean().item()
+        expected = share + (1.0 - share) / 10
+        assert abs(at_the_line - expected) < 4 * math.sqrt(0.25 / 400) * (share < 1.0) + 1e-9
+    with pytest.raises(ValueError, match="share of whole races"):
+        Hurdling(races=1.5)
+
+
 def test_evaluation_and_the_ablation_are_the_race():
     for training, options in ((False, {}), (True, {"curriculum": False})):
         env = make_env("hurdling", num_worlds=8, training=training, options=options)
