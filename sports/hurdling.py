@@ -59,10 +59,6 @@ THROUGH = 0.10
 # The curriculum: heights U(0, h_max), or U(``least`` x h_max, h_max). A hurdle near h_max that was
 # cleared raises it.
 LEAST_MAX, MOST_MAX, RAISE = 0.3, 1.167, 0.15
-RACES = 0.1
-"""Share of training episodes that are the race itself, where ``races`` leaves it. Without them a
-policy whose curriculum had come to 0.32 m (PPO, 29 M samples: 37 m a race) had never seen a hurdle
-of 1.067 m: its normalised observations lay at their bounds, and it fell over at the start."""
 PROOF = 0.8
 """Share of h_max that the highest hurdle cleared must have had to count."""
 
@@ -100,11 +96,12 @@ class Hurdling:
     curriculum: bool = True
     """In training: heights that grow with success, and starts at any hurdle. False: every episode
     is the race."""
-    races: float = RACES
-    """Share of training episodes that are the race itself; the others start at any hurdle. With 1,
-    as without the curriculum, all worlds run side by side: every update learns from one part of the
-    race and may forget the others. Few races leave the start and the hurdles at full speed to few
-    samples."""
+    races: float = 0.1
+    """Share of training episodes that are the race itself; the others start at any hurdle. Without
+    them a policy whose curriculum had come to 0.32 m (PPO, 29 M samples: 37 m a race) had never
+    seen a hurdle of 1.067 m: its normalised observations lay at their bounds, and it fell over at
+    the start. With 1, as without the curriculum, all worlds run side by side: every update learns
+    from one part of the race and may forget the others."""
     toppling: bool = False
     """Hurdles are free bodies that fall when hit. Their height is then that of the race or
     ``height`` in training too: a hurdle that stands on the ground cannot be sunk into it."""
