@@ -17,7 +17,7 @@ import tyro
 from olympics_opt import meter
 from olympics_opt.meter import SIGMA, Row, measure
 from olympics_opt.soak import STEPS, soak
-from olympics_opt.speeds import rate
+from olympics_opt.speeds import overflowed, rate
 from rl import provenance
 from sports.registry import get_task, task_names
 from warmstart.atomic import write_json
@@ -202,7 +202,7 @@ def soak_all(
                     console.print(
                         f"{task} on {engine}: {'clean' if found.clean else 'NOT CLEAN'}; "
                         f"{found.episodes} episodes, {found.nan_worlds} worlds diverged, "
-                        f"{found.overflow} overflowed, {found.bad_observations} and "
+                        f"{overflowed(asdict(found))} overflowed, {found.bad_observations} and "
                         f"{found.bad_rewards} numbers not finite, "
                         f"{rate(found.steps_per_second)} steps/s"
                     )

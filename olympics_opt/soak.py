@@ -43,6 +43,9 @@ class Soak:
     """Of one step, unscaled, by size."""
     nan_worlds: int
     overflow: int
+    overflows: dict[str, int]
+    """Which of the engine's buffers, by its name there, and how often; of a world more than one may
+    overflow."""
     steps_per_second: float
     """Control steps of all worlds together."""
     device_memory_gib: tuple[float, float] | None
@@ -128,6 +131,7 @@ def soak(
             largest_reward=float(largest[1]),
             nan_worlds=int(env.physics.nan_worlds),
             overflow=int(env.physics.overflow),
+            overflows=env.physics.overflows(),
             steps_per_second=worlds * steps / seconds,
             device_memory_gib=None if early is None or late is None else (early, late),
             host_memory_gib=resident_gib(),

@@ -95,11 +95,17 @@ def _soak(row: Mapping[str, Any]) -> list[str]:
         str(row["episodes"]),
         str(row["bad_observations"] + row["bad_rewards"]),
         str(row["nan_worlds"]),
-        str(row["overflow"]),
+        overflowed(row),
         _gib(row.get("device_memory_gib") or [None]),
         rate(row["steps_per_second"]),
         *_origin(row),
     ]
+
+
+def overflowed(row: Mapping[str, Any]) -> str:
+    """How many worlds overflowed in a soak, and which buffers: ``3 (epa_horizon)``."""
+    kinds = ", ".join(sorted(row.get("overflows", ())))
+    return f"{row['overflow']} ({kinds})" if kinds else str(row["overflow"])
 
 
 def _which(row: Mapping[str, Any]) -> list[str]:

@@ -218,11 +218,10 @@ def _starts_of_clips(config: TrainConfig) -> Starts | None:
 
 def _learner(config: TrainConfig, env: Any, device: torch.device) -> Any:
     """A PPO in all runs that have parts or a first policy; a Learner at least."""
-    bf16 = {"auto": None, "float32": False, "bfloat16": True}[config.precision]
     if config.task == PRIOR:
-        return latent_run.make_distiller(config, env, device, bf16)
+        return latent_run.make_distiller(config, env, device, config.bf16)
     sizes = (env.obs_size, env.action_size)
-    return PPO(*sizes, config.hyper, device, config.seed, config.cuda_graph, bf16)
+    return PPO(*sizes, config.hyper, device, config.seed, config.cuda_graph, config.bf16)
 
 
 def _shaped_like(config: TrainConfig, source: str) -> TrainConfig:

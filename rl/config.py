@@ -26,6 +26,8 @@ TRACKING = "tracking"
 """The task of the motion tracker. It is not in the registry: it is nothing without clips."""
 PRIOR = "prior"
 """The distillation of the tracker into a latent prior: not a sport either."""
+LEAST_SIGMA = 0.05
+"""Noise of actions below which bfloat16 is too coarse."""
 APART = (TRACKING, PRIOR, BALANCE)
 """Tasks beside the registry: those that need clips."""
 
@@ -124,9 +126,11 @@ class TrainConfig:
     device: str = "auto"
     """Where the networks live: auto (a GPU if there is one), cpu, cuda."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Of the matrix products: auto is bfloat16 on a GPU and float32 on a CPU, where bfloat16 is
-    about twice as fast if the processor has instructions for it, and slower if not. bfloat16
-    knows an action of 0.5 to 0.002: take float32 where ``--ppo.sigma`` is below 0.02."""
+    """Of the matrix products: auto is bfloat16 on a GPU while ``--ppo.sigma`` stays at
+    ``LEAST_SIGMA`` or above, else float32. On a CPU bfloat16 is about twice as fast if the
+    processor has instructions for it, and slower if not. It knows an action of 0.5 to 0.002, and
+    differs that much between the rows of a rollout and those of a minibatch: at a sigma of 0.02
+    that alone is a divergence of 0.015, which drives the learning rate to its least."""
     checkpoint_minutes: float = 2.0
     """A checkpoint at least this often."""
     checkpoint_iterations: int | None = None
@@ -149,6 +153,15 @@ class TrainConfig:
         ppo = PAPER if self.paper else self.ppo
         # The noise of ``balance`` is the prior's own.
         return replace(ppo, sigma=1.0, sigma_final=None) if self.task == BALANCE else ppo
+
+    @property
+    def bf16(self) -> bool | None:
+        """Whether learners multiply in bfloat16; None for on a GPU only."""
+        if self.precision != "auto":
+            return self.precision == "bfloat16"
+        hyper = self.hyper
+        least = hyper.sigma if hyper.sigma_final is None else min(hyper.sigma, hyper.sigma_final)
+        return None if least >= LEAST_SIGMA else False
 
     @property
     def styled(self) -> bool:

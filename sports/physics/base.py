@@ -106,6 +106,11 @@ class Physics(Protocol):
         """Advances one control step with PD targets ``ctrl`` (N, nu), rad, held constant."""
         ...
 
+    def overflows(self) -> dict[str, int]:
+        """Which buffers overflowed so far, by their names in the engine, and in how many worlds'
+        control steps; waits for the device. Only ``warp`` has buffers of fixed sizes."""
+        ...
+
     def reset(self, mask: Tensor, state: PhysicsState) -> None:
         """Puts the worlds where ``mask`` (N,) is true into their rows of ``state``.
 

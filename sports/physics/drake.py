@@ -155,6 +155,9 @@ class DrakePhysics:
                 self._place(world, self._qpos0, np.zeros(self.scene.nv), self._mocap[world])
         self._publish()
 
+    def overflows(self) -> dict[str, int]:
+        return {}
+
     def reset(self, mask: Tensor, state: PhysicsState) -> None:
         qpos, qvel = state.qpos.double().cpu().numpy(), state.qvel.double().cpu().numpy()
         mocap = state.mocap_pos.double().cpu().numpy()

@@ -75,6 +75,9 @@ class MujocoPhysics:
             safe.wave_phase = None
             self.reset(self.bad, safe)
 
+    def overflows(self) -> dict[str, int]:
+        return {}
+
     def reset(self, mask: Tensor, state: PhysicsState) -> None:
         worlds = mask.nonzero()[:, 0]
         if worlds.numel():

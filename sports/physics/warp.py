@@ -31,9 +31,9 @@ HOLD_ITERATIONS, HOLD_LINE_SEARCH = 10, 20
 """The same for hands that hold something: with 5 / 8, 1 % of the coordinates were more than 1e-3
 away from C MuJoCo's after one control step from the midst of a throw, with these 0.15 %."""
 
-_BUFFERS = int(mjw.OverflowType.ALL) & ~int(
-    mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS
-)
+_PRECISION = (mjw.OverflowType.NONE, mjw.OverflowType.ALL)
+_PRECISION += (mjw.OverflowType.ITERATIONS, mjw.OverflowType.LS_ITERATIONS)
+_BUFFERS = {kind.name.lower(): int(kind) for kind in mjw.OverflowType if kind not in _PRECISION}
 """Overflows that lose contacts or rows; running out of iterations loses only precision."""
 
 
@@ -185,6 +185,8 @@ class WarpPhysics:
         self.bad = torch.zeros(n, dtype=torch.bool, device=self.device)
         self.nan_worlds = torch.zeros((), dtype=torch.long, device=self.device)
         self.overflow = torch.zeros((), dtype=torch.long, device=self.device)
+        self._kinds = torch.tensor(tuple(_BUFFERS.values()), device=self.device)
+        self._overflows = torch.zeros(len(_BUFFERS), dtype=torch.long, device=self.device)
         self.geometry = Geometry(scene.body, self.device)
         qpos0 = torch.tensor(scene.default_qpos(), dtype=torch.float32, device=self.device)
         self.qpos.copy_(qpos0.expand_as(self.qpos))
@@ -203,12 +205,17 @@ class WarpPhysics:
         self._ctrl.copy_(ctrl)
         self.step_graph()
         self._derive()
-        full = (self._overflow & _BUFFERS) != 0
+        kinds = (self._overflow[:, None] & self._kinds) != 0
+        full = kinds.any(-1)
         wrong = diverged(self.qpos, self.qvel)
         self.bad = wrong | full
         self.nan_worlds = self.nan_worlds + wrong.sum()
         self.overflow = self.overflow + full.sum()
+        self._overflows = self._overflows + kinds.sum(0)
         self._overflow.zero_()
+
+    def overflows(self) -> dict[str, int]:
+        return {name: n for name, n in zip(_BUFFERS, self._overflows.tolist()) if n}
 
     def step_graph(self) -> None:
         """Runs only the captured substeps, for benchmarks."""

@@ -10,6 +10,7 @@ import pytest
 
 from olympics_opt import leaderboard
 from olympics_opt.bench import bench, soak_all
+from olympics_opt.speeds import overflowed
 
 
 def result(**changes) -> dict:
@@ -127,6 +128,8 @@ def test_speeds_and_endurance_have_tables(folder: Path):
     assert f"| {100 * speed['environment_share']:.0f} % |" in row
     row = next(line for line in page.splitlines() if "[soak.json]" in line)
     assert row.startswith("| long_jump | mujoco | 2 | 20 |")
+    assert overflowed({"overflow": 3, "overflows": {"nefc": 1, "ccd": 2}}) == "3 (ccd, nefc)"
+    assert overflowed({"overflow": 3}) == "3", "a row of before the kinds were counted"
     heads = [line for line in page.splitlines() if line.startswith("| task |")]
     assert len(heads) == 2 and heads[1].count(" | ") == row.count(" | ")
     (folder / "other.json").write_text(json.dumps({"rows": [{"height": 1.0}]}))

@@ -279,6 +279,23 @@ def test_two_ranks_learn_what_one_process_learns_from_both_batches(tmp_path):
     assert not torch.equal(state[0]["env/x"], state[1]["env/x"])
 
 
+@pytest.mark.parametrize(
+    ("precision", "sigma", "final", "multiplies"),
+    [
+        ("auto", 0.12, None, None),
+        ("auto", 0.12, 0.05, None),
+        ("auto", 0.12, 0.04, False),
+        ("auto", 0.02, None, False),
+        ("bfloat16", 0.02, None, True),
+        ("float32", 0.12, None, False),
+    ],
+)
+def test_bfloat16_is_for_noise_that_hides_its_rounding(precision, sigma, final, multiplies):
+    """A mean action of bfloat16 may be off by 4e-4, a fiftieth of a sigma of 0.02 in each of 69."""
+    ppo = PPOConfig(sigma=sigma, sigma_final=final)
+    assert TrainConfig(task="long_jump", precision=precision, ppo=ppo).bf16 is multiplies
+
+
 @pytest.mark.parametrize("vary", [False, True])
 def test_felt_damping_reaches_the_worlds(vary):
     """The engine of such a run moves as one that was asked for it; with ``vary`` all worlds do."""

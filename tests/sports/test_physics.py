@@ -263,6 +263,24 @@ def test_warp_sums_contacts_as_the_sensors_of_mujoco_do():
     assert pushed > 1000.0
 
 
+def test_a_buffer_that_overflows_is_named_and_its_world_is_bad():
+    """An athlete on its feet needs more than 4 rows; one in the air needs none."""
+    pytest.importorskip("mujoco_warp")
+    scene = make_scene("long_jump")
+    small = make_physics("warp", dataclasses.replace(scene, rows_per_world=4), 2, device="cpu")
+    state = default_state(scene, 2, "cpu")
+    state.qpos[1, 2] += 5.0
+    small.reset(torch.tensor([True, True]), state)
+    ctrl = torch.zeros(2, scene.nu)
+    lost = 0
+    for _ in range(6):
+        small.step(ctrl)
+        lost += int(small.bad[0])
+        assert not small.bad[1]
+    assert int(small.overflow) == lost > 0 and small.overflows() == {"nefc": lost}
+    assert cpu(scene, 1).overflows() == {}
+
+
 @pytest.mark.parametrize("task", ["high_jump", "long_jump"])
 def test_permuting_the_worlds_permutes_every_output(task):
     n = 6
