@@ -74,6 +74,8 @@ class WarpPhysics:
         self.model = model = build_model(scene, sensors=False)
         # Warp never resets a diverged world by itself, and does not know the flag that says so.
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        # Two boxes meet by the law of C MuJoCo, in up to 8 points, not in up to 4 of them.
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
         if felt_damping and variation is None:
             firm_ground(model)
         drawn = None

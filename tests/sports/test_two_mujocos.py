@@ -54,30 +54,12 @@ def test_a_second_of_standing_is_the_same(task):
         env.close()
 
 
-def contact_counts(mine: Env, other: Env) -> tuple[torch.Tensor, torch.Tensor]:
-    """(N,) contacts that each engine finds in its present state."""
-    import mujoco
-    import mujoco_warp as mjw
-
-    model, counts = mine.physics.model, []
-    data = mujoco.MjData(model)
-    for qpos in mine.physics.qpos:
-        data.qpos[:] = qpos
-        mujoco.mj_forward(model, data)
-        counts.append(data.ncon)
-    warp = other.physics
-    for stage in (mjw.kinematics, mjw.com_pos, mjw.collision):
-        stage(warp.m, warp.d)
-    found = warp.d.contact.worldid.numpy()[: int(warp.d.nacon.numpy()[0])]
-    per_world = torch.bincount(torch.from_numpy(found), minlength=len(counts))
-    return torch.tensor(counts), per_world
-
-
 @pytest.mark.parametrize("task", MODELS)
 def test_a_step_from_the_midst_of_an_episode_is_the_same(task):
-    """One control step from states that random play led to. Two boxes that overlap, such as the
-    feet of an athlete who stumbles, meet in up to 8 points, of which the engines find different
-    numbers (docs/physics.md): such worlds are counted, and left out of the comparison."""
+    """One control step from states that random play led to, all worlds. Where two boxes overlap,
+    such as the feet of an athlete who stumbles, both engines find the same points (up to 8); with
+    Warp's own law for boxes, up to 4 of them, 2 % of the tennis player's coordinates were further
+    off than 1e-3."""
     mine, other = both(task, MID_EPISODE)
     generator = torch.Generator().manual_seed(0)
 
@@ -116,17 +98,13 @@ def test_a_step_from_the_midst_of_an_episode_is_the_same(task):
         before.append(features(env))
         env.keep_snapshot = True
     torch.testing.assert_close(*before, rtol=1e-3, atol=1e-3)
-    found, found_by_warp = contact_counts(mine, other)
-    alike = found == found_by_warp
-    assert alike.float().mean() > 0.85
     a, b = mine.step(action), other.step(action)
     moved = [env.final_snapshot["qpos"] for env in (mine, other)]
-    difference = (moved[0] - moved[1]).abs()[alike]
-    assert difference.median() < 1e-5
-    assert (difference < 1e-3).float().mean() > 0.99
-    same = alike.clone()
-    same[alike] = (difference < 1e-3).all(-1)
-    assert same.float().mean() > 0.8
+    difference = (moved[0] - moved[1]).abs()
+    assert difference.median() < 1e-6
+    assert (difference < 1e-3).float().mean() > 0.998
+    same = (difference < 1e-3).all(-1)
+    assert same.float().mean() >= 0.97
     far = torch.stack([(v - b.terms[k]).abs() > 1e-3 + 1e-3 * v.abs() for k, v in a.terms.items()])
     # A term or flag may differ where a number lies at its threshold.
     assert far.any(0).any(-1)[same].float().mean() <= 0.03
