@@ -32,7 +32,7 @@ def record_curve(
     Args:
         progress: ``progress.csv`` of a run.
         card: of the policy it ended with; its origin is copied.
-        out: JSON file, written atomically: the origin, and ``rows``, a list of numbers (null where
+        out: JSON file, written atomically, on one line: the origin, and ``rows``, a list of numbers (null where
             there was none) for each column: samples, minutes, mean return and length of episodes,
             speed, broken worlds, and every metric and curriculum.
         points: rows to keep, evenly spread.
@@ -48,7 +48,8 @@ def record_curve(
     names = [k for k in rows[0] if k in KEPT or k.startswith(("metrics/", "curriculum/"))]
     columns = {name: [_number(rows[i][name]) for i in picked] for name in names}
     origin = {name: card[name] for name in ORIGIN if name in card}
-    return write_json(out, {"format": "olympics-opt curve 1", **origin, "rows": columns})
+    curve = {"format": "olympics-opt curve 1", **origin, "rows": columns}
+    return write_json(out, curve, indent=None)
 
 
 def _number(text: str | None) -> float | None:

@@ -30,9 +30,12 @@ def write_text(path: str | Path, text: str) -> Path:
     return write_bytes(path, text.encode())
 
 
-def write_json(path: str | Path, value: Any) -> Path:
-    """Writes strict JSON atomically: a number that is not finite becomes null."""
-    return write_text(path, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+def write_json(path: str | Path, value: Any, indent: int | None = 2) -> Path:
+    """Writes strict JSON atomically: a number that is not finite becomes null. ``indent`` None: on
+    one line, for long lists of numbers."""
+    separators = (",", ":") if indent is None else None
+    text = json.dumps(_plain(value), indent=indent, separators=separators, allow_nan=False)
+    return write_text(path, text + "\n")
 
 
 def prepare(path: str | Path) -> Path:
