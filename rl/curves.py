@@ -32,9 +32,9 @@ def record_curve(
     Args:
         progress: ``progress.csv`` of a run.
         card: of the policy it ended with; its origin is copied.
-        out: JSON file, written atomically, on one line: the origin, and ``rows``, a list of numbers (null where
-            there was none) for each column: samples, minutes, mean return and length of episodes,
-            speed, broken worlds, and every metric and curriculum.
+        out: JSON file, written atomically, on one line: the origin, and ``rows``, a list of numbers
+            (null where there was none) for each column: samples, minutes, mean return and length of
+            episodes, speed, broken worlds, and every metric and curriculum.
         points: rows to keep, evenly spread.
 
     Raises ValueError for a file without rows or columns of a curve.
