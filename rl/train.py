@@ -26,6 +26,7 @@ from rl.config import DEFAULT_SAMPLES, PRIOR, TrainConfig, load_starts, parse_ar
 from rl.host import Signals, Stopwatch, join_ranks, one_torch_thread
 from rl.profiling import profile_training
 from rl.ranks import over_ranks
+from rl.rate_watch import RateWatch
 from rl.rollout import collect
 from rl.run_folder import Progress, restore, save, settle, write_config
 from rl.runlog import Row, RunLog
@@ -126,7 +127,7 @@ class _Trainer:
             write_config(self.made)
             self._greet()
         self.began = time.monotonic() - 60.0 * self.now.minutes
-        saved_at, saved = self.now.minutes, None
+        saved_at, saved, watch = self.now.minutes, None, RateWatch(config.hyper)
         try:
             with Signals() as signals:
                 while not (stopped_by := self._stopped_by(part, signals)):
@@ -136,6 +137,9 @@ class _Trainer:
                             after = self.now.iteration - 1
                             log = RunLog(config.out, list(row), after, config.quiet)
                         log.write(row, self._share())
+                        advice = watch(row, self._share())
+                        if advice is not None and not config.quiet:
+                            print(f"warning: {advice}", file=sys.stderr, flush=True)
                         if self.on_iteration is not None:
                             self.on_iteration(row)
                     saved = save(self.made, self.now) if self._save_due(saved_at) else None
