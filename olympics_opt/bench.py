@@ -191,7 +191,7 @@ def soak_all(
 
                     found = soak(task, engine, worlds=count, steps=steps, seed=seed, on_step=show)
                     progress.remove_task(bar)
-                    kept[task, engine, count] = asdict(found) | {
+                    row = kept[task, engine, count] = asdict(found) | {
                         "clean": found.clean,
                         "seed": seed,
                         "commit": provenance.commit(),
@@ -202,7 +202,7 @@ def soak_all(
                     console.print(
                         f"{task} on {engine}: {'clean' if found.clean else 'NOT CLEAN'}; "
                         f"{found.episodes} episodes, {found.nan_worlds} worlds diverged, "
-                        f"{overflowed(asdict(found))} overflowed, {found.bad_observations} and "
+                        f"{overflowed(row)} overflowed, {found.bad_observations} and "
                         f"{found.bad_rewards} numbers not finite, "
                         f"{rate(found.steps_per_second)} steps/s"
                     )

@@ -92,6 +92,13 @@ class PPOConfig:
     critic_warmup: int = 5
     """Iterations in which only the critic learns, after a start from a policy without one."""
 
+    def kl_band_at(self, share: float) -> tuple[float, float] | None:
+        """The band in the part of the run that is done, ``share`` in 0..1."""
+        if self.kl_band is None or self.kl_band_final is None:
+            return self.kl_band
+        (low, high), (last_low, last_high) = self.kl_band, self.kl_band_final
+        return annealed(low, last_low, share), annealed(high, last_high, share)
+
     def __post_init__(self) -> None:
         if self.entropy_coefficient != 0.0:
             raise ValueError("entropy_coefficient must be 0: this policy's sigma is not learned")
@@ -232,9 +239,9 @@ class PPO:
     def schedule(self, share: float) -> None:
         """Sets sigma and the KL band for the part of the run that is done, 0..1."""
         c = self.config
-        if c.kl_band is not None and c.kl_band_final is not None:
-            for i, ends in enumerate(zip(c.kl_band, c.kl_band_final)):
-                self.kl_band[i] = annealed(*ends, share)
+        if c.kl_band_final is not None:
+            for i, end in enumerate(c.kl_band_at(share) or ()):
+                self.kl_band[i] = end
         if c.sigma_final is not None:
             self.sigma.fill_(annealed(c.sigma, c.sigma_final, share))
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-
-from rl.annealing import annealed
 from rl.ppo import PPOConfig
 from rl.runlog import Row
 
@@ -17,22 +14,21 @@ class RateWatch:
 
     def __init__(self, config: PPOConfig) -> None:
         self.config = config
-        self._above: deque[bool] = deque(maxlen=ITERATIONS)
-        self._told = False
+        self._above = 0
+        """Iterations in a row."""
 
     def __call__(self, row: Row, share: float) -> str | None:
         """One sentence, once, where the divergence has stayed above its band at the least learning
         rate: the updates are then larger than was asked for, and what they learn is mostly noise.
         ``share`` of the run is done, 0..1."""
-        band, least = self.config.kl_band, self.config.learning_rate_limits[0]
+        band, least = self.config.kl_band_at(share), self.config.learning_rate_limits[0]
         kl, rate = row.get("kl"), row.get("learning_rate")
-        if self._told or band is None or kl is None or rate is None:
+        if self._above == ITERATIONS or band is None or kl is None or rate is None:
             return None
-        most = annealed(band[1], (self.config.kl_band_final or band)[1], share)
-        self._above.append(kl > most and rate <= least * 1.001)
-        if sum(self._above) < ITERATIONS:
+        most = band[1]
+        self._above = self._above + 1 if kl > most and rate <= least * 1.001 else 0
+        if self._above < ITERATIONS:
             return None
-        self._told = True
         return (
             f"the divergence has been above {most:.3g} for {ITERATIONS} iterations at the least "
             f"learning rate, {least:.3g}: lower --ppo.learning-rate-limits, or take --precision "

@@ -136,8 +136,9 @@ class _Trainer:
                         if log is None:
                             after = self.now.iteration - 1
                             log = RunLog(config.out, list(row), after, config.quiet)
-                        log.write(row, self._share())
-                        advice = watch(row, self._share())
+                        share = self._share()
+                        log.write(row, share)
+                        advice = watch(row, share)
                         if advice is not None and not config.quiet:
                             print(f"warning: {advice}", file=sys.stderr, flush=True)
                         if self.on_iteration is not None:

@@ -31,10 +31,9 @@ HOLD_ITERATIONS, HOLD_LINE_SEARCH = 10, 20
 """The same for hands that hold something: with 5 / 8, 1 % of the coordinates were more than 1e-3
 away from C MuJoCo's after one control step from the midst of a throw, with these 0.15 %."""
 
-_PRECISION = (mjw.OverflowType.NONE, mjw.OverflowType.ALL)
-_PRECISION += (mjw.OverflowType.ITERATIONS, mjw.OverflowType.LS_ITERATIONS)
+_PRECISION = (mjw.OverflowType.ITERATIONS, mjw.OverflowType.LS_ITERATIONS)
 _BUFFERS = {kind.name.lower(): int(kind) for kind in mjw.OverflowType if kind not in _PRECISION}
-"""Overflows that lose contacts or rows; running out of iterations loses only precision."""
+"""Overflows that lose contacts or rows, by name; running out of iterations loses only precision."""
 
 
 class WarpPhysics:

@@ -54,6 +54,25 @@ def test_a_second_of_standing_is_the_same(task):
         env.close()
 
 
+def contact_counts(mine: Env, other: Env) -> tuple[torch.Tensor, torch.Tensor]:
+    """(N,) contacts that each engine finds in its present state."""
+    import mujoco
+    import mujoco_warp as mjw
+
+    model, counts = mine.physics.model, []
+    data = mujoco.MjData(model)
+    for qpos in mine.physics.qpos:
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        counts.append(data.ncon)
+    warp = other.physics
+    for stage in (mjw.kinematics, mjw.com_pos, mjw.collision):
+        stage(warp.m, warp.d)
+    found = warp.d.contact.worldid.numpy()[: int(warp.d.nacon.numpy()[0])]
+    per_world = torch.bincount(torch.from_numpy(found), minlength=len(counts))
+    return torch.tensor(counts), per_world
+
+
 @pytest.mark.parametrize("task", MODELS)
 def test_a_step_from_the_midst_of_an_episode_is_the_same(task):
     """One control step from states that random play led to, all worlds. Where two boxes overlap,
@@ -98,6 +117,8 @@ def test_a_step_from_the_midst_of_an_episode_is_the_same(task):
         before.append(features(env))
         env.keep_snapshot = True
     torch.testing.assert_close(*before, rtol=1e-3, atol=1e-3)
+    found, found_by_warp = contact_counts(mine, other)
+    assert (found == found_by_warp).float().mean() > 0.97
     a, b = mine.step(action), other.step(action)
     moved = [env.final_snapshot["qpos"] for env in (mine, other)]
     difference = (moved[0] - moved[1]).abs()
