@@ -153,8 +153,12 @@ class Hurdling:
     hurdles, where they are fastest, and two per cent of speed are worth seven races of a hundred
     to them (1.6 M samples of PPO: 18.2 to 18.0 s and 96 to 62 %)."""
     finish_ends: bool = False
-    """End the episode at the finish. Nothing is paid beyond it: training is spared idle steps. The
-    paper's distance needs the whole 600."""
+    """End the episode at the finish, or at the end of the run-out: training is spared idle steps.
+    The paper's distance needs the whole 600."""
+    run_out: float = 0.0
+    """Metres beyond the finish that are paid for like those before it; 0 for none, as in the paper.
+    A policy that never saw the far side of the finish falls there: 89 of 100 races won in MuJoCo,
+    5 of them on the feet at the end (Drake: 17 of 20), and 139 m run instead of 162."""
 
     def __post_init__(self) -> None:
         low, high, kind = 0.0, HIGHEST, "hurdle"
@@ -168,6 +172,8 @@ class Hurdling:
             raise ValueError(f"the charge for leaving the middle must not be negative: {self.lane}")
         if self.finish < 0.0:
             raise ValueError(f"the prize at the finish must not be negative: {self.finish}")
+        if self.run_out < 0.0:
+            raise ValueError(f"the run-out must not be shorter than 0 m: {self.run_out}")
         if not 0.0 <= self.races <= 1.0:
             raise ValueError(f"the share of whole races must lie in [0, 1], not {self.races}")
         if not 0.0 <= self.run_up < GAP / 2:
@@ -400,7 +406,11 @@ def advance(view: View, memory: Memory) -> Advance:
     if view.config.finish > 0.0:
         terms["finish"] = view.config.finish * arrives
     was_x = was_along[:, 0]
-    ended = failed | finished if view.config.finish_ends else failed
+    end = FINISH_X + view.config.run_out
+    if view.config.run_out > 0.0:
+        new = x.clamp(max=end) - memory["x_max"].clamp(min=FINISH_X)
+        terms["run_out"] = new.clamp(0.0, 1.0) * finished
+    ended = failed | (finished & (x > end)) if view.config.finish_ends else failed
     steps = view.clock - 1 + (FINISH_X - was_x) / (x - was_x)
     time = torch.where(arrives, steps * view.control_timestep, memory["time"])
 

@@ -160,6 +160,25 @@ def test_nothing_is_paid_beyond_the_finish():
     assert float(world.advance().terms["progress"][0, 0]) == 0.0
 
 
+def test_a_run_out_is_paid_for_new_ground_to_its_end_and_to_nobody_who_fell_before_the_finish():
+    def steps(*xs: float, y: float = 0.0) -> list[tuple[float, bool]]:
+        world = at(109.7, run_out=2.0, finish_ends=True)
+        told = []
+        for x in xs:
+            world.place((x, y, STANDING))
+            step = world.advance()
+            told.append((float(step.terms["run_out"][0, 0]), bool(step.terminated[0, 0])))
+        return told
+
+    run = steps(109.9, 110.4, 111.2, 110.9, 111.5, 112.3)
+    assert [paid for paid, _ in run] == pytest.approx([0.0, 0.4, 0.8, 0.0, 0.3, 0.5], abs=1e-4)
+    assert [ended for _, ended in run] == [False] * 5 + [True]
+    assert [paid for paid, _ in steps(110.4, 111.2, y=0.9)] == [0.0, 0.0]
+    assert "run_out" not in at(109.7).advance().terms
+    with pytest.raises(ValueError, match="run-out"):
+        Hurdling(run_out=-1.0)
+
+
 @pytest.mark.parametrize(("y", "out"), [(0.79, False), (0.81, True), (-0.79, False), (-0.81, True)])
 def test_the_lane(y: float, out: bool):
     world = at(5.0)
