@@ -397,30 +397,44 @@ def export_policy(
     weights = dict(policy.actor.state_dict())
     if critic:
         weights |= policy.extra
-    weights = {  # running moments stay in float64
-        k: v.contiguous() if k.startswith("value_norm.") else v.half().contiguous()
-        for k, v in weights.items()
-    }
-    if not all(torch.isfinite(v).all() for v in weights.values()):
-        raise PolicyError(f"the weights of run '{run}' do not fit fp16")
-    if precision == "int8":
-        weights = packed(weights)
-    data = save(weights)
+    try:
+        data = packed_weights(weights, precision)
+    except ValueError as error:
+        raise PolicyError(f"the weights of run '{run}' {error}") from None
     digest = hashlib.sha256(data).hexdigest()
     if metrics_of and metrics_of not in (policy.metadata["sha256"], digest):
         raise PolicyError(
             f"the metrics are of another policy ({metrics_of[:12]}...) than the last checkpoint "
             f"of '{run}': evaluate that one"
         )
-    card: dict[str, Any] = {**policy.metadata, "sha256": digest, "precision": precision}
-    card["config"] = portable(card.get("config", {}))
+    card: dict[str, Any] = {**policy.metadata, "precision": precision}
     if metrics is not None:
         card["metrics"] = metrics
     if looks:
         card["looks"] = looks
+    return write_policy(data, card, out)
+
+
+def packed_weights(
+    weights: dict[str, Tensor], precision: Literal["float16", "int8"] = "float16"
+) -> bytes:
+    """The content of a policy's weight file. Raises ValueError where they do not fit fp16."""
+    halves = {  # running moments stay in float64
+        k: v.contiguous() if k.startswith("value_norm.") else v.half().contiguous()
+        for k, v in weights.items()
+    }
+    if not all(torch.isfinite(v).all() for v in halves.values()):
+        raise ValueError("do not fit fp16")
+    return save(packed(halves) if precision == "int8" else halves)
+
+
+def write_policy(data: bytes, card: dict[str, Any], out: Path | str) -> Path:
+    """Writes ``packed_weights`` and their card, which gets their sha256 and keeps no path of this
+    machine; returns the path, whose suffix is always ``.safetensors``."""
+    digest = hashlib.sha256(data).hexdigest()
+    card = {**card, "sha256": digest, "config": portable(card.get("config", {}))}
     path = Path(out).with_suffix(".safetensors")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, data)
-    text = json.dumps(card, indent=1, allow_nan=False)
-    write_text(path.with_suffix(".json"), text)
+    write_text(path.with_suffix(".json"), json.dumps(card, indent=1, allow_nan=False))
     return path

@@ -6,12 +6,14 @@ Every world plays the same number of episodes, one after another, with the polic
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from rl.host import one_torch_thread
 from rl.policy import Policy
@@ -63,8 +65,15 @@ class Played:
 
 def play_share(policy: Policy, share: Share, report: Callable[[int], None] | None = None) -> Played:
     """Plays one in this process; ``report`` is called with the number of trials done."""
-    episodes = math.ceil(share.trials / share.worlds)
-    worlds = math.ceil(share.trials / episodes)
+    with opened(policy, share) as env:
+        return play_episodes(policy, share, env, report)
+
+
+@contextmanager
+def opened(policy: Policy, share: Share) -> Iterator[Env]:
+    """The worlds of a share, for as long as they are played in. Raises PolicyError for a policy
+    that does not fit them."""
+    worlds = math.ceil(share.trials / math.ceil(share.trials / share.worlds))
     env = make_env(
         share.task,
         engine=share.engine,
@@ -84,7 +93,7 @@ def play_share(policy: Policy, share: Share, report: Callable[[int], None] | Non
         if share.start_noise > 0.0:
             env.starts = standing_starts(env, share.start_noise, share.seed)
         with one_torch_thread(env.device):
-            return _play_episodes(policy, share, env, episodes, report)
+            yield env
     finally:
         env.close()
 
@@ -151,14 +160,15 @@ class _Episodes:
         return True
 
 
-def _play_episodes(
-    policy: Policy,
+def play_episodes(
+    policy: Callable[[Tensor], Tensor],
     share: Share,
     env: Env,
-    episodes: int,
-    report: Callable[[int], None] | None,
+    report: Callable[[int], None] | None = None,
 ) -> Played:
-    played = _Episodes(env, share.task, episodes)
+    """Plays a share in worlds that are ``opened`` already; played again, its starts are others.
+    ``policy`` maps observations (N, A, D) to actions."""
+    played = _Episodes(env, share.task, math.ceil(share.trials / env.num_worlds))
     tape = Tape(env, share.record or bool(share.worlds_recorded))
     obs = env.reset()
     while not played.over:

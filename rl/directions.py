@@ -1,0 +1,116 @@
+"""Directions in the space of a policy's weights, along which it may be moved as a whole.
+
+Shapes: K directions, D observation, H units of the last hidden layer, U action size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rl.policy import Policy, PolicyError
+
+Weights = dict[str, Tensor]
+"""An actor's ``state_dict``, or a change of some of it."""
+
+
+@dataclass(frozen=True)
+class Directions:
+    """A policy's weights and K changes of them, each for one unit of its number."""
+
+    base: Weights
+    changes: Sequence[Weights]
+
+    def at(self, numbers: Tensor) -> Weights:
+        """The weights at (K,) numbers; the policy's own at zeros."""
+        there = {name: x.clone() for name, x in self.base.items()}
+        for number, change in zip(numbers.tolist(), self.changes, strict=True):
+            for name, x in change.items():
+                there[name] += number * x
+        return there
+
+
+def weights_of(policy: Policy) -> Weights:
+    """The actor's weights. Raises PolicyError for a baseline, which has none."""
+    if policy.actor is None:
+        raise PolicyError("a baseline has no weights that could be changed")
+    return {name: x.detach().clone() for name, x in policy.actor.state_dict().items()}
+
+
+def towards(policy: Policy, other: Policy) -> Weights:
+    """What makes ``other`` of ``policy``, which keeps its own observation statistics: those of
+    ``other`` go into the weights of its first layer. Exact where neither clips an observation.
+
+    Raises PolicyError for another network, another prior or other ranges of clipping.
+    """
+    base, goal = weights_of(policy), weights_of(other)
+    own, theirs = policy.metadata, other.metadata
+    fits = {n: x.shape for n, x in base.items()} == {n: x.shape for n, x in goal.items()}
+    same = ("activation", "observation_clip", "latent")
+    if not fits or any(own.get(name) != theirs.get(name) for name in same):
+        raise PolicyError(
+            "only policies with networks, clipping and latents of one kind can be mixed"
+        )
+    first = "trunk.0"
+    weight = goal[f"{first}.weight"]
+    goal[f"{first}.bias"] = goal[f"{first}.bias"] + weight @ (
+        (policy.mean - other.mean) / other.std
+    )
+    goal[f"{first}.weight"] = weight * (policy.std / other.std)
+    return {name: goal[name] - base[name] for name in base}
+
+
+def scaled(change: Mapping[str, Tensor], unit: float) -> Weights:
+    """The same direction in another unit."""
+    return {name: unit * x for name, x in change.items()}
+
+
+def moved(change: Mapping[str, Tensor], device: torch.device | str) -> Weights:
+    """The same on a device."""
+    return {name: x.to(device) for name, x in change.items()}
+
+
+@dataclass(frozen=True)
+class Phases:
+    """What the last hidden layer of a policy at play does: its mean and its strongest principal
+    components, which follow the phases of the motion."""
+
+    middle: Tensor
+    """(H,)"""
+    axes: Tensor
+    """(P, H): a component's value is axis . (layer - middle), 1 in root mean square."""
+
+
+def phases(policy: Policy, obs: Tensor, components: int) -> Phases:
+    """Those of the observations (M, D). Raises ValueError where the layer has fewer of them."""
+    assert policy.actor is not None
+    with torch.no_grad():
+        clip = policy.metadata["observation_clip"]
+        seen = ((torch.nan_to_num(obs) - policy.mean) / policy.std).clamp(-clip, clip)
+        hidden = policy.actor.trunk(seen).double()  # (M, H)
+    middle = hidden.mean(0)
+    _, spread, axes = torch.linalg.svd(hidden - middle, full_matrices=False)
+    if components > int((spread > 1e-6 * hidden.norm()).sum()):
+        raise ValueError(f"the last hidden layer does not vary in {components} ways")
+    # Along an axis the layer varies by spread / sqrt(M).
+    scale = len(hidden) ** 0.5 / spread[:components, None]
+    return Phases(middle.float(), (axes[:components] * scale).float())
+
+
+def shifts(policy: Policy, found: Phases, unit: float) -> list[Weights]:
+    """U (1 + P) changes of the last layer that move one action each: by ``unit`` always, or by
+    ``unit`` times a component: more of it in one phase of the motion and less in another."""
+    assert policy.actor is not None
+    changes: list[Weights] = []
+    for action in range(policy.actor.head.out_features):
+        one = torch.zeros_like(policy.actor.head.bias)
+        one[action] = unit
+        changes.append({"head.bias": one})
+        changes += [
+            {"head.weight": torch.outer(one, axis), "head.bias": -one * (axis @ found.middle)}
+            for axis in found.axes
+        ]
+    return changes

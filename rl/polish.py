@@ -1,0 +1,377 @@
+"""Polishes a trained policy by its whole episodes.
+
+The noise of PPO is drawn anew in every step, and each step is blamed for what comes after it. Where
+a race is lost by the rhythm of its strides, nearly all of that blame is noise: a hurdler that won
+96 races of 100 forgot how in five such trainings. Here a candidate is the policy with its weights
+moved a little, the same way for a whole episode. It plays its mean action, as in an evaluation, and
+what counts is what its episodes come to. The search is CMA-ES (Hansen 2016, arXiv:1604.00772) over
+a few directions in the space of the weights (``rl/directions.py``): towards other states of the
+same training, and shifts of the actions in step with the phases of the motion. Its middle is the
+result.
+
+Shapes: C candidates besides the middle, E episodes of each, K directions.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cma
+import numpy as np
+import torch
+from torch import Tensor
+
+from rl.directions import (
+    Directions,
+    Phases,
+    Weights,
+    moved,
+    phases,
+    scaled,
+    shifts,
+    towards,
+    weights_of,
+)
+from rl.policy import Policy, as_trained, load_policy, packed_weights, write_policy
+from rl.policy_stack import PolicyStack
+from rl.trials import Share, opened, play_episodes
+from sports.env import Env
+from sports.registry import get_task
+from sports.starts import START_NOISE
+from warmstart.npz import read_npz, write_npz
+
+T = TypeVar("T")
+STATE, POLICY = "search.npz", "policy.safetensors"
+WATCHED_EVERY = 7
+"""Steps between those whose observations tell how the last hidden layer varies: no divisor of a
+stride."""
+WATCHED_ROWS = 20_000
+
+
+@dataclass(frozen=True)
+class Polishing:
+    """What is searched, and how long."""
+
+    task: str
+    policy: str
+    others: tuple[str, ...] = ()
+    """Policies with the same network: one direction leads to each."""
+    components: int = 4
+    """Principal components of the last hidden layer with which actions shift; -1 for no shifts."""
+    objective: str = ""
+    """See ``aims``; the task's main metric where empty."""
+    candidates: int = 23
+    """C."""
+    episodes: int = 24
+    """E."""
+    generations: int | None = None
+    """None: as many as the minutes allow."""
+    minutes: float | None = None
+    shift: float = 0.004
+    """First spread of each shift (root mean square of the action, 1 = its bound)."""
+    share: float = 0.2
+    """First spread of the way to each other policy."""
+    seed: int = 0
+    engine: str = "mujoco"
+    strength: str | None = None
+    limits: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.candidates < 4 or self.episodes < 1:
+            raise ValueError("a search needs at least 4 candidates with 1 episode each")
+        if self.components < -1 or (self.components < 0 and not self.others):
+            raise ValueError("nothing to search: give components >= 0 or other policies")
+        if self.shift <= 0.0 or self.share <= 0.0:
+            raise ValueError("the first spreads must be positive")
+        if self.generations is None and self.minutes is None:
+            raise ValueError("say for how many generations or minutes to search")
+
+    @property
+    def blocks(self) -> int:
+        """The middle and its candidates."""
+        return 1 + self.candidates
+
+    def over(self, generation: int, minutes: float) -> bool:
+        """Whether the search is done after so many."""
+        enough = self.generations is not None and generation >= self.generations
+        return enough or (self.minutes is not None and minutes >= self.minutes)
+
+
+@dataclass(frozen=True)
+class Aim:
+    """A metric of an episode and what it is worth."""
+
+    metric: str
+    weight: float
+    zero: float
+    """The value that is worth nothing."""
+
+
+def aims(text: str, task: str) -> list[Aim]:
+    """``success=1 time=-0.3@18.2`` -> a point for success and 0.3 for each second below 18.2.
+
+    Names are those of the task's metrics and ``return``. A metric that an episode does not have
+    (the time of a race that was not finished) is worth nothing. Raises ValueError.
+    """
+    spec = get_task(task)
+    found = []
+    for word in text.split() or [f"{spec.main_metric}=1"]:
+        metric, _, numbers = word.partition("=")
+        weight, _, zero = numbers.partition("@")
+        try:
+            aim = Aim(metric, float(weight), float(zero or 0.0))
+        except ValueError:
+            text = f"'{word}' is no aim: write METRIC=WEIGHT or METRIC=WEIGHT@ZERO"
+            raise ValueError(text) from None
+        if not math.isfinite(aim.weight) or not math.isfinite(aim.zero):
+            raise ValueError(f"an aim takes finite numbers, not '{word}'")
+        if aim.metric not in (*spec.metrics, "return"):
+            known = ", ".join((*spec.metrics, "return"))
+            raise ValueError(f"'{task}' has no metric '{aim.metric}'; it has: {known}")
+        found.append(aim)
+    return found
+
+
+def worth(trials: Mapping[str, np.ndarray], wanted: Sequence[Aim]) -> np.ndarray:
+    """(trials,) what each is worth."""
+    return sum(np.nan_to_num(a.weight * (trials[a.metric] - a.zero)) for a in wanted)  # type: ignore[return-value]
+
+
+class Crowd:
+    """Plays several policies of one network at once, each in its own block of worlds."""
+
+    def __init__(self, policy: Policy, size: int) -> None:
+        assert policy.actor is not None
+        self.policy = policy
+        clip = policy.metadata["observation_clip"]
+        self.stack = PolicyStack(policy.actor, size, clip, policy.mean.device)
+
+    def write(self, slot: int, weights: Weights) -> None:
+        """Who plays in a block."""
+        self.stack.write(slot, weights, self.policy.mean, self.policy.std)
+
+    def __call__(self, obs: Tensor) -> Tensor:
+        """(N, A, D) -> (N, A, action); worlds in blocks, one after another."""
+        blocks = obs.reshape(len(self.stack.mean), -1, obs.shape[-1])
+        action = self.stack(blocks).view(*obs.shape[:-1], -1)
+        return action if self.policy.layer is None else self.policy.layer(obs, action)
+
+
+@dataclass
+class Search:
+    """CMA-ES with independent spreads, which may stop after any generation and go on.
+
+    Numbers are in units of their first spread. What goes on is the middle and the spreads; the
+    paths that the spreads have come by begin anew.
+    """
+
+    middle: np.ndarray
+    """(K,)"""
+    spreads: np.ndarray
+    """(K,)"""
+    candidates: int
+    seed: int
+    generation: int = 0
+
+    def __post_init__(self) -> None:
+        self._rng = np.random.default_rng((self.seed, self.generation))
+        options = {
+            "popsize": self.candidates,
+            "CMA_diagonal": True,
+            "CMA_stds": self.spreads,
+            "randn": lambda *shape: self._rng.standard_normal(shape),
+            "seed": np.nan,  # leaves NumPy's own generator alone
+            "verbose": -9,
+            "maxiter": np.inf,
+        }
+        self._strategy = cma.CMAEvolutionStrategy(self.middle, 1.0, options)
+
+    def advance(self, judge: Callable[[np.ndarray], tuple[np.ndarray, T]]) -> tuple[np.ndarray, T]:
+        """One generation; ``judge`` maps the middle and the candidates (1 + C, K) to their worth
+        (1 + C,) and something more; both are returned."""
+        self._rng = np.random.default_rng((self.seed, self.generation))
+        asked = self._strategy.ask()
+        values, more = judge(np.vstack((self.middle, asked)))
+        self._strategy.tell(asked, (-values[1:]).tolist())
+        self.middle = np.array(self._strategy.mean)
+        self.spreads = np.array(self._strategy.result.stds)  # pyright: ignore[reportAttributeAccessIssue]
+        self.generation += 1
+        return values, more
+
+
+@dataclass(frozen=True)
+class Generation:
+    """What one came to."""
+
+    number: int
+    minutes: float
+    episodes: int
+    """Played so far."""
+    middle: float
+    """Worth of the middle that the candidates were drawn around."""
+    candidates: float
+    """Their mean."""
+    metrics: dict[str, float]
+    """Means over all candidates."""
+    spread: float
+    """Geometric mean, in units of the first."""
+
+
+def polish(
+    config: Polishing,
+    out: Path,
+    options: dict[str, Any] | None = None,
+    progress: Callable[[Generation], None] | None = None,
+) -> list[Generation]:
+    """Searches, and writes the middle as ``out/policy.safetensors`` after every generation.
+
+    The same call goes on where one was stopped. ``options`` are the task's. Returns what this
+    call's generations came to. Raises PolicyError and ValueError for what does not fit, before
+    anything is written.
+    """
+    began = time.monotonic()
+    wanted = aims(config.objective, config.task)
+    policy = load_policy(config.policy, config.task)
+    weights_of(policy)  # a baseline has none
+    ways = [towards(policy, load_policy(name, config.task)) for name in config.others]
+    share = _share(config, policy, options)
+    told: list[Generation] = []
+    with opened(policy, share) as env:
+        search, found = _begin(config, out, policy, lambda: watched(policy, share, env))
+        changes = [moved(scaled(way, config.share), env.device) for way in ways]
+        if found is not None:
+            changes += shifts(policy, found, config.shift)
+        directions, crowd = Directions(weights_of(policy), changes), Crowd(policy, config.blocks)
+
+        def judge(numbers: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+            for slot, row in enumerate(numbers):
+                crowd.write(slot, directions.at(torch.from_numpy(row)))
+            trials = play_episodes(crowd, share, env).trials
+            return worth(trials, wanted).reshape(config.blocks, -1).mean(1), trials
+
+        while not config.over(search.generation, (time.monotonic() - began) / 60.0):
+            values, trials = search.advance(judge)
+            _save(config, out, policy, directions, search, found)
+            told.append(
+                Generation(
+                    number=search.generation,
+                    minutes=(time.monotonic() - began) / 60.0,
+                    episodes=search.generation * share.trials,
+                    middle=float(values[0]),
+                    candidates=float(values[1:].mean()),
+                    metrics=_means(trials),
+                    spread=float(np.exp(np.log(search.spreads).mean())),
+                )
+            )
+            if progress is not None:
+                progress(told[-1])
+    return told
+
+
+def _share(config: Polishing, policy: Policy, options: dict[str, Any] | None) -> Share:
+    """The episodes of a generation."""
+    athlete = as_trained(policy, config.task, config.strength, config.limits, options)
+    return Share(
+        task=config.task,
+        engine=config.engine,
+        trials=config.blocks * config.episodes,
+        worlds=config.blocks * config.episodes,
+        seed=config.seed,
+        strength=athlete.strength,
+        limits=athlete.limits,
+        options=athlete.options,
+        physics_options={},
+        timestep_divisor=1,
+        start_noise=START_NOISE,
+        record=False,
+        worlds_recorded=(),
+    )
+
+
+def _means(trials: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Of the metrics that some trial has."""
+    return {n: float(np.nanmean(x)) for n, x in trials.items() if not np.isnan(x).all()}
+
+
+def watched(policy: Policy, share: Share, env: Env) -> Tensor:
+    """(M, D) observations of the policy at play, from all phases of its episodes."""
+    seen: list[Tensor] = []
+    steps = 0
+
+    def probe(obs: Tensor) -> Tensor:
+        nonlocal steps
+        if steps % WATCHED_EVERY == 0:
+            seen.append(obs.flatten(0, -2).clone())
+        steps += 1
+        return policy(obs)
+
+    play_episodes(probe, share, env)
+    rows = torch.cat(seen)
+    return rows[:: max(1, len(rows) // WATCHED_ROWS)]
+
+
+def _begin(
+    config: Polishing, out: Path, policy: Policy, watch: Callable[[], Tensor]
+) -> tuple[Search, Phases | None]:
+    """A new search with the phases that it shifts actions in, or what ``out`` holds of one. Raises
+    ValueError for another one's."""
+    path = out / STATE
+    device = policy.mean.device
+    if path.exists():
+        needed = ("middle", "spreads")
+        arrays, meta = read_npz(path, needed, ("phase_middle", "phase_axes"), what="search")
+        if meta.get("about") != _about(config, policy):
+            raise ValueError(f"'{out}' holds another search: give another folder")
+        kept = [arrays.get(name) for name in ("phase_middle", "phase_axes")]
+        found = None
+        if kept[0] is not None and kept[1] is not None:
+            found = Phases(*(torch.tensor(x, dtype=torch.float32, device=device) for x in kept))
+        middle, spreads, generation = arrays["middle"], arrays["spreads"], int(meta["generation"])
+    else:
+        found = None if config.components < 0 else phases(policy, watch(), config.components)
+        actions = int(policy.metadata["action_size"])
+        size = len(config.others) + actions * (1 + config.components)
+        middle, spreads, generation = np.zeros(size), np.ones(size), 0
+    return Search(middle, spreads, config.candidates, config.seed, generation), found
+
+
+def _about(config: Polishing, policy: Policy) -> dict[str, Any]:
+    """What a search that goes on must have been about."""
+    names = ("others", "components", "objective", "shift", "share")
+    said = {name: getattr(config, name) for name in names}
+    return json.loads(json.dumps(said | {"of": policy.metadata["sha256"]}))
+
+
+def _save(
+    config: Polishing,
+    out: Path,
+    policy: Policy,
+    directions: Directions,
+    search: Search,
+    found: Phases | None,
+) -> None:
+    """Writes the middle as a policy, then the search."""
+    middle = directions.at(torch.from_numpy(search.middle))
+    episodes = search.generation * config.blocks * config.episodes
+    card = {
+        **policy.metadata,
+        "precision": "float16",
+        "polish": {**_about(config, policy), "episodes": episodes},
+        "metrics": {},
+    }
+    write_policy(packed_weights(moved(middle, "cpu")), card, out / POLICY)
+    arrays = {"middle": search.middle, "spreads": search.spreads}
+    if found is not None:
+        arrays |= {
+            "phase_middle": found.middle.cpu().numpy(),
+            "phase_axes": found.axes.cpu().numpy(),
+        }
+    write_npz(
+        out / STATE, arrays, {"about": _about(config, policy), "generation": search.generation}
+    )

@@ -1,0 +1,173 @@
+"""Whether a search over whole episodes finds a known optimum, and what it moves is what it says."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from rl.directions import Directions, phases, scaled, shifts, towards, weights_of
+from rl.networks import MLP
+from rl.policy import Policy, PolicyError, load_policy
+from rl.polish import Aim, Crowd, Polishing, Search, aims, polish, worth
+
+D, H, U = 6, 5, 3
+
+
+def made(seed: int, hidden: int = H) -> Policy:
+    """A small policy with statistics of its own."""
+    generator = torch.Generator().manual_seed(seed)
+    actor = MLP(D, (8, hidden), U, generator=generator).requires_grad_(False)
+    mean = torch.randn(D, generator=generator)
+    std = torch.rand(D, generator=generator) + 0.5
+    card = {"observation_clip": 50.0, "activation": "silu", "action_size": U, "sha256": str(seed)}
+    return Policy(actor, mean, std, card)
+
+
+def played(policy: Policy, weights: dict[str, torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
+    """Actions of the policy's network with other weights."""
+    actor = MLP(D, (8, H), U)
+    actor.load_state_dict(weights)
+    return replace(policy, actor=actor)(obs)
+
+
+def test_the_whole_way_to_another_policy_is_that_policy_whatever_its_statistics():
+    own, other = made(0), made(1)
+    directions = Directions(weights_of(own), [towards(own, other)])
+    obs = torch.randn(40, D)
+    torch.testing.assert_close(played(own, directions.at(torch.zeros(1)), obs), own(obs))
+    there = played(own, directions.at(torch.ones(1)), obs)
+    torch.testing.assert_close(there, other(obs), atol=1e-4, rtol=0)
+    quarter = Directions(weights_of(own), [scaled(towards(own, other), 0.25)])
+    there = played(own, quarter.at(torch.full((1,), 4.0)), obs)
+    torch.testing.assert_close(there, other(obs), atol=1e-4, rtol=0)
+    with pytest.raises(PolicyError, match="one kind"):
+        towards(own, made(2, hidden=7))
+
+
+def test_a_shift_moves_one_action_by_its_unit():
+    policy, unit, parts = made(0), 0.01, 2
+    obs = torch.randn(4000, D)
+    found = phases(policy, obs, parts)
+    changes = shifts(policy, found, unit)
+    assert len(changes) == U * (1 + parts)
+    base = policy(obs)
+    for k, change in enumerate(changes):
+        action, part = divmod(k, 1 + parts)
+        one = torch.nn.functional.one_hot(torch.tensor(k), len(changes)).float()
+        moved = played(policy, Directions(weights_of(policy), changes).at(one), obs) - base
+        others = [u for u in range(U) if u != action]
+        assert moved[:, others].abs().max() == 0.0, change
+        mean, size = float(moved[:, action].mean()), float(moved[:, action].square().mean().sqrt())
+        assert size == pytest.approx(unit, rel=1e-3)
+        assert mean == pytest.approx(unit if part == 0 else 0.0, abs=1e-5)
+    # What follows one component does not follow the other.
+    first, second = (played(policy, Directions(weights_of(policy), changes).at(e), obs) - base
+                     for e in torch.eye(len(changes))[1:3])  # fmt: skip
+    assert float((first[:, 0] * second[:, 0]).mean()) == pytest.approx(0.0, abs=1e-7)
+    with pytest.raises(ValueError, match="ways"):
+        phases(policy, obs[:1].repeat(9, 1), 1)
+
+
+def test_everyone_in_a_crowd_plays_in_its_own_block():
+    policy, others = made(0), [made(1), made(2)]
+    crowd = Crowd(policy, 3)
+    ways = Directions(weights_of(policy), [towards(policy, other) for other in others])
+    for slot, numbers in enumerate(([0.0, 0.0], [1.0, 0.0], [0.0, 1.0])):
+        crowd.write(slot, ways.at(torch.tensor(numbers)))
+    obs = torch.randn(12, 2, D)  # 3 blocks of 4 worlds, 2 agents
+    action = crowd(obs)
+    for slot, one in enumerate((policy, *others)):
+        rows = slice(4 * slot, 4 * slot + 4)
+        torch.testing.assert_close(action[rows], one(obs[rows]), atol=1e-4, rtol=0)
+
+
+def test_the_search_finds_a_known_optimum_in_noise():
+    goal = np.linspace(-2.0, 2.0, 8)
+    noise = np.random.default_rng(0)
+
+    def judge(numbers: np.ndarray) -> tuple[np.ndarray, None]:
+        return -((numbers - goal) ** 2).sum(1) + noise.normal(0.0, 0.05, len(numbers)), None
+
+    search = Search(np.zeros(8), np.ones(8), candidates=16, seed=0)
+    first = judge(search.middle[None])[0]
+    for _ in range(60):
+        values, _ = search.advance(judge)
+    assert np.abs(search.middle - goal).max() < 0.2
+    assert values[0] > -0.2 > first[0]
+    assert (search.spreads < 0.5).all()
+
+
+def test_aims_are_read_and_paid():
+    wanted = aims("success=1 time=-0.3@18.2", "hurdling")
+    assert wanted == [Aim("success", 1.0, 0.0), Aim("time", -0.3, 18.2)]
+    trials = {"success": np.array([1.0, 0.0]), "time": np.array([17.2, np.nan])}
+    np.testing.assert_allclose(worth(trials, wanted), [1.3, 0.0])
+    assert aims("", "javelin")[0].weight == 1.0
+    for text, said in (
+        ("success", "no aim"),
+        ("success=one", "no aim"),
+        ("time=nan", "finite"),
+        ("gold=1", "no metric 'gold'; it has: success"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            aims(text, "hurdling")
+
+
+CONFIG = Polishing(
+    task="long_jump",
+    policy="pretrained",
+    components=1,
+    objective="length=1",
+    candidates=4,
+    episodes=1,
+    generations=2,
+)
+
+
+def test_a_search_that_was_stopped_goes_on_and_its_middle_is_what_was_written(tmp_path: Path):
+    told = polish(CONFIG, tmp_path / "whole")
+    assert [now.number for now in told] == [1, 2]
+    assert told[-1].episodes == 2 * 5 and np.isfinite(told[-1].middle)
+    written = load_policy(tmp_path / "whole" / "policy.safetensors", "long_jump")
+    own = load_policy("pretrained", "long_jump")
+    assert written.metadata["polish"]["of"] == own.metadata["sha256"]
+    moved = (weights_of(written)["head.bias"] - weights_of(own)["head.bias"]).abs()
+    assert 0.0 < float(moved.max()) < 0.1
+    same = weights_of(own)["trunk.0.weight"]
+    torch.testing.assert_close(weights_of(written)["trunk.0.weight"], same, atol=1e-4, rtol=2e-3)
+
+    polish(replace(CONFIG, generations=1), tmp_path / "parts")
+    assert [now.number for now in polish(CONFIG, tmp_path / "parts")] == [2]
+    assert polish(CONFIG, tmp_path / "parts") == []  # nothing left to do
+    with pytest.raises(ValueError, match="another search"):
+        polish(replace(CONFIG, shift=0.1), tmp_path / "parts")
+
+
+def test_mistakes_are_told_before_anything_is_played(tmp_path: Path):
+    for change, said in (
+        ({"generations": None}, "generations or minutes"),
+        ({"components": -1}, "nothing to search"),
+        ({"candidates": 2}, "at least 4"),
+        ({"share": 0.0}, "positive"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            replace(CONFIG, **change)
+    with pytest.raises(PolicyError, match="baseline"):
+        polish(replace(CONFIG, policy="zero"), tmp_path)
+    with pytest.raises(PolicyError, match="not of 'long_jump'"):
+        polish(replace(CONFIG, policy=shipped("high_jump")), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def shipped(task: str) -> str:
+    """File of a shipped policy."""
+    from rl import pretrained
+
+    path = pretrained.locate(task, "ppo")
+    assert json.loads(path.with_suffix(".json").read_text())["task"] == task
+    return str(path)
