@@ -377,6 +377,9 @@ class Polish:
     """First spread of each shift (root mean square of the action; 1 is its bound)."""
     share: float = 0.2
     """First spread of the way to each other policy."""
+    start_noise: float = 0.02
+    """+- joint noise of the starts (rad). More than the 0.02 of an evaluation tells more about what
+    hardly ever fails."""
     engine: Literal["mujoco", "warp", "drake"] = "mujoco"
     """Physics engine; ``warp`` needs a GPU."""
     seed: int = 0

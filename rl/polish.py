@@ -77,6 +77,9 @@ class Polishing:
     """First spread of each shift (root mean square of the action, 1 = its bound)."""
     share: float = 0.2
     """First spread of the way to each other policy."""
+    start_noise: float = START_NOISE
+    """+- joint noise of the starts (rad); more of it than in an evaluation tells more about what
+    hardly ever fails."""
     seed: int = 0
     engine: str = "mujoco"
     strength: str | None = None
@@ -87,6 +90,8 @@ class Polishing:
             raise ValueError("a search needs at least 4 candidates with 1 episode each")
         if self.components < -1 or (self.components < 0 and not self.others):
             raise ValueError("nothing to search: give components >= 0 or other policies")
+        if not 0.0 <= self.start_noise < 1.0:
+            raise ValueError(f"the starts' noise must lie in [0, 1) rad, not {self.start_noise}")
         if self.shift <= 0.0 or self.share <= 0.0:
             raise ValueError("the first spreads must be positive")
         if self.generations is None and self.minutes is None:
@@ -288,7 +293,7 @@ def _share(config: Polishing, policy: Policy, options: dict[str, Any] | None) ->
         options=athlete.options,
         physics_options={},
         timestep_divisor=1,
-        start_noise=START_NOISE,
+        start_noise=config.start_noise,
         record=False,
         worlds_recorded=(),
     )

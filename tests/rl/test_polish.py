@@ -154,6 +154,7 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path):
         ({"components": -1}, "nothing to search"),
         ({"candidates": 2}, "at least 4"),
         ({"share": 0.0}, "positive"),
+        ({"start_noise": -0.1}, "noise"),
     ):
         with pytest.raises(ValueError, match=said):
             replace(CONFIG, **change)
