@@ -18,7 +18,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -40,6 +40,7 @@ from rl.directions import (
 )
 from rl.policy import Policy, as_trained, load_policy, packed_weights, write_policy
 from rl.policy_stack import PolicyStack
+from rl.runlog import Row, RunLog
 from rl.trials import Share, opened, play_episodes
 from sports.env import Env
 from sports.registry import get_task
@@ -102,10 +103,14 @@ class Polishing:
         """The middle and its candidates."""
         return 1 + self.candidates
 
+    def done(self, generation: int, minutes: float) -> float:
+        """The share of the search that is done after so many, 0 to 1."""
+        shares = ((generation, self.generations), (minutes, self.minutes))
+        return min(1.0, max((n / of if of else 1.0) for n, of in shares if of is not None))
+
     def over(self, generation: int, minutes: float) -> bool:
-        """Whether the search is done after so many."""
-        enough = self.generations is not None and generation >= self.generations
-        return enough or (self.minutes is not None and minutes >= self.minutes)
+        """Whether the search is done."""
+        return self.done(generation, minutes) >= 1.0
 
 
 @dataclass(frozen=True)
@@ -210,45 +215,38 @@ class Search:
         return values, more
 
 
-@dataclass(frozen=True)
-class Generation:
-    """What one came to."""
+@dataclass
+class Spent:
+    """What a search has taken, over all calls."""
 
-    number: int
-    minutes: float
-    episodes: int
-    """Played so far."""
-    middle: float
-    """Worth of the middle that the candidates were drawn around."""
-    candidates: float
-    """Their mean."""
-    metrics: dict[str, float]
-    """Means over all candidates."""
-    spread: float
-    """Geometric mean, in units of the first."""
+    minutes: float = 0.0
+    samples: int = 0
+    """Control steps of episodes that counted."""
+
+
+COLUMNS = ("iteration", "samples", "minutes", "episodes", "middle", "candidates", "spread")
+"""Of progress.csv, with the metrics: a generation a row. ``middle`` is the worth of the middle that
+the candidates were drawn around, ``candidates`` the mean of theirs, ``spread`` the geometric mean
+of the spreads in units of the first; metrics are means over all episodes of the generation."""
 
 
 def polish(
-    config: Polishing,
-    out: Path,
-    options: dict[str, Any] | None = None,
-    progress: Callable[[Generation], None] | None = None,
-) -> list[Generation]:
-    """Searches, and writes the middle as ``out/policy.safetensors`` after every generation.
+    config: Polishing, out: Path, options: dict[str, Any] | None = None, quiet: bool = False
+) -> list[Row]:
+    """Searches; after every generation writes ``out/policy.safetensors``, the middle, and a row of
+    ``out/progress.csv``, and shows it unless ``quiet``.
 
-    The same call goes on where one was stopped. ``options`` are the task's. Returns what this
-    call's generations came to. Raises PolicyError and ValueError for what does not fit, before
-    anything is written.
+    The same call goes on where one was stopped. ``options`` are the task's. Returns the rows of
+    this call. Raises PolicyError and ValueError for what does not fit, before anything is written.
     """
-    began = time.monotonic()
     wanted = aims(config.objective, config.task)
     policy = load_policy(config.policy, config.task)
     weights_of(policy)  # a baseline has none
     ways = [towards(policy, load_policy(name, config.task)) for name in config.others]
     share = _share(config, policy, options)
-    told: list[Generation] = []
+    rows: list[Row] = []
     with opened(policy, share) as env:
-        search, found = _begin(config, out, policy, lambda: watched(policy, share, env))
+        search, found, spent = _begin(config, out, policy, lambda: watched(policy, share, env))
         changes = [moved(scaled(way, config.share), env.device) for way in ways]
         if found is not None:
             changes += shifts(policy, found, config.shift)
@@ -260,23 +258,30 @@ def polish(
             trials = play_episodes(crowd, share, env).trials
             return worth(trials, wanted).reshape(config.blocks, -1).mean(1), trials
 
-        while not config.over(search.generation, (time.monotonic() - began) / 60.0):
+        names = [f"metrics/{name}" for name in env.metric_names]
+        log = RunLog(out, [*COLUMNS, *names], search.generation, quiet)
+        began = time.monotonic()
+        while not config.over(search.generation, spent.minutes):
             values, trials = search.advance(judge)
-            _save(config, out, policy, directions, search, found)
-            told.append(
-                Generation(
-                    number=search.generation,
-                    minutes=(time.monotonic() - began) / 60.0,
-                    episodes=search.generation * share.trials,
-                    middle=float(values[0]),
-                    candidates=float(values[1:].mean()),
-                    metrics=_means(trials),
-                    spread=float(np.exp(np.log(search.spreads).mean())),
-                )
+            now = time.monotonic()
+            spent.minutes, began = spent.minutes + (now - began) / 60.0, now
+            spent.samples += int(trials["episode_steps"].sum())
+            _save(config, out, policy, directions, search, found, spent)
+            rows.append(
+                {
+                    "iteration": search.generation,
+                    "samples": spent.samples,
+                    "minutes": spent.minutes,
+                    "episodes": search.generation * share.trials,
+                    "middle": float(values[0]),
+                    "candidates": float(values[1:].mean()),
+                    "spread": float(np.exp(np.log(search.spreads).mean())),
+                    **{f"metrics/{name}": _mean(trials[name]) for name in env.metric_names},
+                }
             )
-            if progress is not None:
-                progress(told[-1])
-    return told
+            log.write(rows[-1], config.done(search.generation, spent.minutes))
+        log.close()
+    return rows
 
 
 def _share(config: Polishing, policy: Policy, options: dict[str, Any] | None) -> Share:
@@ -299,9 +304,9 @@ def _share(config: Polishing, policy: Policy, options: dict[str, Any] | None) ->
     )
 
 
-def _means(trials: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Of the metrics that some trial has."""
-    return {n: float(np.nanmean(x)) for n, x in trials.items() if not np.isnan(x).all()}
+def _mean(values: np.ndarray) -> float | None:
+    """Of the trials that have one."""
+    return None if np.isnan(values).all() else float(np.nanmean(values))
 
 
 def watched(policy: Policy, share: Share, env: Env) -> Tensor:
@@ -323,7 +328,7 @@ def watched(policy: Policy, share: Share, env: Env) -> Tensor:
 
 def _begin(
     config: Polishing, out: Path, policy: Policy, watch: Callable[[], Tensor]
-) -> tuple[Search, Phases | None]:
+) -> tuple[Search, Phases | None, Spent]:
     """A new search with the phases that it shifts actions in, or what ``out`` holds of one. Raises
     ValueError for another one's."""
     path = out / STATE
@@ -338,12 +343,13 @@ def _begin(
         if kept[0] is not None and kept[1] is not None:
             found = Phases(*(torch.tensor(x, dtype=torch.float32, device=device) for x in kept))
         middle, spreads, generation = arrays["middle"], arrays["spreads"], int(meta["generation"])
+        spent = Spent(float(meta["minutes"]), int(meta["samples"]))
     else:
         found = None if config.components < 0 else phases(policy, watch(), config.components)
         actions = int(policy.metadata["action_size"])
         size = len(config.others) + actions * (1 + config.components)
-        middle, spreads, generation = np.zeros(size), np.ones(size), 0
-    return Search(middle, spreads, config.candidates, config.seed, generation), found
+        middle, spreads, generation, spent = np.zeros(size), np.ones(size), 0, Spent()
+    return Search(middle, spreads, config.candidates, config.seed, generation), found, spent
 
 
 def _about(config: Polishing, policy: Policy) -> dict[str, Any]:
@@ -360,6 +366,7 @@ def _save(
     directions: Directions,
     search: Search,
     found: Phases | None,
+    spent: Spent,
 ) -> None:
     """Writes the middle as a policy, then the search."""
     middle = directions.at(torch.from_numpy(search.middle))
@@ -377,6 +384,5 @@ def _save(
             "phase_middle": found.middle.cpu().numpy(),
             "phase_axes": found.axes.cpu().numpy(),
         }
-    write_npz(
-        out / STATE, arrays, {"about": _about(config, policy), "generation": search.generation}
-    )
+    meta = {"about": _about(config, policy), "generation": search.generation}
+    write_npz(out / STATE, arrays, meta | asdict(spent))

@@ -119,6 +119,9 @@ _SHOWN = (
     "active",
     "learning_rate",
     "sigma",
+    "middle",
+    "candidates",
+    "spread",
 )
 
 

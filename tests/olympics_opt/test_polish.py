@@ -15,7 +15,7 @@ def test_a_policy_is_polished_with_the_options_of_its_task(tmp_path: Path, capsy
     words += ["--objective", "success=1 time=-0.3@18.2", "--task.finish-ends"]
     assert cli.main(words) == 0
     text = " ".join(capsys.readouterr().out.split())
-    assert "generation 1, 5 episodes" in text and "olympics-opt evaluate hurdling" in text
+    assert "iteration 1 |" in text and "olympics-opt evaluate hurdling" in text
     card = load_policy(out / "policy.safetensors", "hurdling").metadata
     assert card["polish"]["episodes"] == 5
     assert card["polish"]["objective"] == "success=1 time=-0.3@18.2"

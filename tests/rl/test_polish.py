@@ -14,6 +14,7 @@ from rl.directions import Directions, phases, scaled, shifts, towards, weights_o
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError, load_policy
 from rl.polish import Aim, Crowd, Polishing, Search, aims, polish, worth
+from rl.runlog import read_progress
 
 D, H, U = 6, 5, 3
 
@@ -130,9 +131,11 @@ CONFIG = Polishing(
 
 
 def test_a_search_that_was_stopped_goes_on_and_its_middle_is_what_was_written(tmp_path: Path):
-    told = polish(CONFIG, tmp_path / "whole")
-    assert [now.number for now in told] == [1, 2]
-    assert told[-1].episodes == 2 * 5 and np.isfinite(told[-1].middle)
+    told = polish(CONFIG, tmp_path / "whole", quiet=True)
+    assert [row["iteration"] for row in told] == [1, 2]
+    assert told[-1]["episodes"] == 2 * 5 and np.isfinite(float(told[-1]["middle"] or np.nan))
+    for row, read in zip(told, read_progress(tmp_path / "whole"), strict=True):
+        assert read == pytest.approx(row)
     written = load_policy(tmp_path / "whole" / "policy.safetensors", "long_jump")
     own = load_policy("pretrained", "long_jump")
     assert written.metadata["polish"]["of"] == own.metadata["sha256"]
@@ -141,9 +144,14 @@ def test_a_search_that_was_stopped_goes_on_and_its_middle_is_what_was_written(tm
     same = weights_of(own)["trunk.0.weight"]
     torch.testing.assert_close(weights_of(written)["trunk.0.weight"], same, atol=1e-4, rtol=2e-3)
 
-    polish(replace(CONFIG, generations=1), tmp_path / "parts")
-    assert [now.number for now in polish(CONFIG, tmp_path / "parts")] == [2]
-    assert polish(CONFIG, tmp_path / "parts") == []  # nothing left to do
+    polish(replace(CONFIG, generations=1), tmp_path / "parts", quiet=True)
+    assert [row["iteration"] for row in polish(CONFIG, tmp_path / "parts", quiet=True)] == [2]
+    assert polish(CONFIG, tmp_path / "parts", quiet=True) == []  # nothing left to do
+    kept = read_progress(tmp_path / "parts")
+    assert [row["iteration"] for row in kept] == [1, 2]
+    assert kept[0]["samples"] == told[0]["samples"]
+    for name in ("samples", "minutes"):
+        assert float(kept[1][name] or 0) > float(kept[0][name] or 0) > 0, name
     with pytest.raises(ValueError, match="another search"):
         polish(replace(CONFIG, shift=0.1), tmp_path / "parts")
 
