@@ -55,6 +55,10 @@ class BenchConfig:
     """Instead of speed, measure endurance: random actions for many steps, and what goes wrong."""
     steps: int = STEPS
     """Control steps of an endurance run."""
+    minutes: float | None = None
+    """Time limit of this call for each endurance run."""
+    keep: Path | None = None
+    """Folder in which endurance runs keep their worlds, so that the same command goes on."""
 
 
 def bench(
@@ -154,15 +158,18 @@ def soak_all(
     worlds: Sequence[int] = (),
     steps: int = STEPS,
     seed: int = 0,
+    minutes: float | None = None,
+    keep: Path | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Plays every task for a long time under random actions and writes what happened as JSON.
 
     What the file holds of other tasks, engines and numbers of worlds stays: a soak of all tasks
-    takes hours and may be done in several goes. Each row says at which commit and on what it was
-    measured.
+    takes hours and may be done in several goes. One task may be, too, with ``keep``: its row says
+    how many steps it has come to. Each row says at which commit and on what it was measured last.
 
-    Arguments as of :func:`bench`; ``steps``: control steps of each world.
+    Arguments as of :func:`bench`; ``steps``: control steps of each world; ``minutes``: of each task
+    in this call; ``keep``: folder of the worlds of tasks that are to go on.
 
     Raises:
         ValueError: unknown task or engine, or counts that are not positive.
@@ -189,7 +196,16 @@ def soak_all(
                     def show(step: int, bar: Any = bar) -> None:
                         progress.update(bar, completed=step)
 
-                    found = soak(task, engine, worlds=count, steps=steps, seed=seed, on_step=show)
+                    found = soak(
+                        task,
+                        engine,
+                        worlds=count,
+                        steps=steps,
+                        seed=seed,
+                        on_step=show,
+                        keep=None if keep is None else keep / f"{task}_{engine}_{count}",
+                        minutes=minutes,
+                    )
                     progress.remove_task(bar)
                     row = kept[task, engine, count] = asdict(found) | {
                         "clean": found.clean,
@@ -200,7 +216,8 @@ def soak_all(
                     result["soak"] = list(kept.values())
                     write_json(out, result)
                     console.print(
-                        f"{task} on {engine}: {'clean' if found.clean else 'NOT CLEAN'}; "
+                        f"{task} on {engine}: {'clean' if found.clean else 'NOT CLEAN'} after "
+                        f"{found.steps} of {steps} steps; "
                         f"{found.episodes} episodes, {found.nan_worlds} worlds diverged, "
                         f"{overflowed(row)} overflowed, {found.bad_observations} and "
                         f"{found.bad_rewards} numbers not finite, "
@@ -261,6 +278,8 @@ def main(args: Sequence[str] | None = None) -> int:
             worlds=config.worlds,
             steps=config.steps,
             seed=config.seed,
+            minutes=config.minutes,
+            keep=config.keep,
         )
         return 0
     bench(

@@ -7,13 +7,17 @@ buffers that overflow, rewards or observations of absurd size, and memory that g
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from olympics_opt.meter import device_name, resident_gib
+from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
 from sports.env import Env, make_env
 
 STEPS = 10_000
@@ -58,6 +62,25 @@ class Soak:
         return self.bad_observations == self.bad_rewards == self.overflow == 0
 
 
+@dataclass
+class Tally:
+    """What has been counted so far, over all calls."""
+
+    step: int = 0
+    """Control steps of each world."""
+    bad_observations: int = 0
+    bad_rewards: int = 0
+    episodes: int = 0
+    largest_observation: float = 0.0
+    largest_reward: float = 0.0
+    nan_worlds: int = 0
+    overflow: int = 0
+    overflows: dict[str, int] = field(default_factory=dict)
+    seconds: float = 0.0
+    early_gib: float | None = None
+    """Memory of the GPU in use after a hundredth of the steps."""
+
+
 def soak(
     task: str,
     engine: str,
@@ -67,6 +90,8 @@ def soak(
     seed: int = 0,
     physics_options: dict[str, Any] | None = None,
     on_step: Callable[[int], None] | None = None,
+    keep: Path | None = None,
+    minutes: float | None = None,
 ) -> Soak:
     """Plays ``steps`` control steps of random actions in ``worlds`` worlds.
 
@@ -78,43 +103,34 @@ def soak(
         seed: of actions and starts.
         physics_options: of the engine.
         on_step: called with the number of steps taken, now and then.
+        keep: folder in which the worlds are kept at the end; the same call goes on with them.
+        minutes: time limit of this call; its ``steps`` are those taken until then, by all calls.
 
     Raises:
-        ValueError: unknown task or engine, or counts that are not positive.
+        ValueError: unknown task or engine, counts that are not positive, or a folder that keeps
+            another endurance run.
+        CheckpointError: the folder cannot be read or written.
         RuntimeError: the engine cannot run here.
     """
     if min(worlds, steps) < 1:
         raise ValueError(f"worlds and steps must be positive, not {worlds} and {steps}")
+    if minutes is not None and minutes <= 0.0:
+        raise ValueError(f"the minutes must be positive, not {minutes}")
+    about = {"task": task, "engine": engine, "worlds": worlds, "seed": seed, "sigma": SIGMA}
     env = make_env(
         task, engine=engine, num_worlds=worlds, seed=seed, physics_options=physics_options
     )
     try:
+        tally = _begin(keep, about, env)
         generator = torch.Generator(env.device).manual_seed(seed)
-        shape = (min(ACTIONS, steps), worlds, env.num_agents, env.action_size)
+        shape = (ACTIONS, worlds, env.num_agents, env.action_size)
         actions = SIGMA * torch.randn(shape, generator=generator, device=env.device)
-        # Of numbers: not finite in features and rewards; of worlds: ended.
-        counts = torch.zeros(3, dtype=torch.long, device=env.device)
-        largest = torch.zeros(2, device=env.device)
-        early, began = _device_gib(env), time.perf_counter()
-        for step in range(steps):
-            result = env.step(actions[step % len(actions)])
-            # The environment removes NaN from its observations; here they are looked for.
-            features = torch.cat(tuple(env.task.features(env.view, env.memory).values()), -1)
-            counts += torch.stack(
-                (
-                    (~features.isfinite()).sum(),
-                    (~result.reward.isfinite()).sum(),
-                    (result.ended | ~result.valid).sum(),
-                )
-            )
-            sizes = torch.stack((result.obs.abs().amax(), result.reward.abs().amax()))
-            largest = torch.maximum(largest, sizes)
-            if step % max(1, steps // 100) == 0:
-                early = _device_gib(env) if step <= steps // 100 else early
-                if on_step is not None:
-                    on_step(step + 1)
-        bad_features, bad_rewards, episodes = counts.tolist()
-        seconds = time.perf_counter() - began
+        _play(env, actions, tally, steps, minutes, on_step)
+        if keep is not None:
+            try:
+                save_checkpoint(keep, tally.step, {"soak": about | asdict(tally)}, env.state_dict())
+            except OSError as error:
+                raise CheckpointError(f"'{keep}' cannot be written: {error}") from error
         late = _device_gib(env)
         return Soak(
             task=task,
@@ -122,22 +138,89 @@ def soak(
             device=device_name(env.device),
             worlds=worlds,
             agents=env.num_agents,
-            steps=steps,
+            steps=tally.step,
             sigma=SIGMA,
-            episodes=episodes,
-            bad_observations=bad_features,
-            bad_rewards=bad_rewards,
-            largest_observation=float(largest[0]),
-            largest_reward=float(largest[1]),
-            nan_worlds=int(env.physics.nan_worlds),
-            overflow=int(env.physics.overflow),
-            overflows=env.physics.overflows(),
-            steps_per_second=worlds * steps / seconds,
-            device_memory_gib=None if early is None or late is None else (early, late),
+            episodes=tally.episodes,
+            bad_observations=tally.bad_observations,
+            bad_rewards=tally.bad_rewards,
+            largest_observation=tally.largest_observation,
+            largest_reward=tally.largest_reward,
+            nan_worlds=tally.nan_worlds,
+            overflow=tally.overflow,
+            overflows=tally.overflows,
+            steps_per_second=worlds * tally.step / max(tally.seconds, 1e-9),
+            device_memory_gib=None
+            if tally.early_gib is None or late is None
+            else (tally.early_gib, late),
             host_memory_gib=resident_gib(),
         )
     finally:
         env.close()
+
+
+def _begin(keep: Path | None, about: dict[str, Any], env: Env) -> Tally:
+    """The tally of the worlds that a folder keeps, which the environment takes back."""
+    saved = [] if keep is None else checkpoints(keep)
+    if not saved:
+        return Tally()
+    state, tensors = load_checkpoint(saved[-1])
+    told = dict(state.get("soak", {}))
+    if {name: told.pop(name, None) for name in about} != about:
+        raise ValueError(f"'{keep}' keeps another endurance run: give another folder")
+    env.load_state_dict(tensors)
+    return Tally(**told)
+
+
+def _play(
+    env: Env,
+    actions: Tensor,
+    tally: Tally,
+    steps: int,
+    minutes: float | None,
+    on_step: Callable[[int], None] | None,
+) -> None:
+    """Plays until ``steps`` and adds to the tally."""
+    before = (tally.nan_worlds, tally.overflow, dict(tally.overflows))
+    # Of numbers: not finite in features and rewards; of worlds: ended.
+    counts = torch.zeros(3, dtype=torch.long, device=env.device)
+    largest = torch.zeros(2, device=env.device)
+    early, mark, began = max(1, steps // 100), max(1, steps // 100), time.perf_counter()
+    if tally.step == 0:
+        tally.early_gib = _device_gib(env)
+    while tally.step < steps:
+        result = env.step(actions[tally.step % len(actions)])
+        # The environment removes NaN from its observations; here they are looked for.
+        features = torch.cat(tuple(env.task.features(env.view, env.memory).values()), -1)
+        counts += torch.stack(
+            (
+                (~features.isfinite()).sum(),
+                (~result.reward.isfinite()).sum(),
+                (result.ended | ~result.valid).sum(),
+            )
+        )
+        sizes = torch.stack((result.obs.abs().amax(), result.reward.abs().amax()))
+        largest = torch.maximum(largest, sizes)
+        tally.step += 1
+        if tally.step == early:
+            tally.early_gib = _device_gib(env)
+        if tally.step % mark == 0:
+            if on_step is not None:
+                on_step(tally.step)
+            largest.tolist()  # waits for the device: steps that are only queued take no time
+            if minutes is not None and time.perf_counter() - began >= 60.0 * minutes:
+                break
+    bad_observations, bad_rewards, episodes = counts.tolist()
+    tally.bad_observations += bad_observations
+    tally.bad_rewards += bad_rewards
+    tally.episodes += episodes
+    sizes = largest.tolist()
+    tally.largest_observation = max(tally.largest_observation, sizes[0])
+    tally.largest_reward = max(tally.largest_reward, sizes[1])
+    tally.nan_worlds = before[0] + int(env.physics.nan_worlds)
+    tally.overflow = before[1] + int(env.physics.overflow)
+    found = Counter(before[2]) + Counter(env.physics.overflows())
+    tally.overflows = dict(found)
+    tally.seconds += time.perf_counter() - began
 
 
 def _device_gib(env: Env) -> float | None:

@@ -181,6 +181,23 @@ def test_bare_warp_is_mujoco() -> None:
         env.close()
 
 
+def test_an_endurance_run_in_two_goes_is_the_same_as_in_one(tmp_path: Path) -> None:
+    whole = soak("long_jump", "mujoco", worlds=3, steps=90)
+    keep = tmp_path / "worlds"
+    first = soak("long_jump", "mujoco", worlds=3, steps=50, keep=keep)
+    both = soak("long_jump", "mujoco", worlds=3, steps=90, keep=keep)
+    assert first.steps == 50 and first.episodes < both.episodes
+    for name in ("steps", "episodes", "largest_observation", "largest_reward", "nan_worlds"):
+        assert getattr(both, name) == getattr(whole, name), name
+    assert soak("long_jump", "mujoco", worlds=3, steps=90, keep=keep).episodes == both.episodes
+    with pytest.raises(ValueError, match="another endurance run"):
+        soak("long_jump", "mujoco", worlds=3, steps=90, seed=1, keep=keep)
+    short = soak("long_jump", "mujoco", worlds=3, steps=10_000, minutes=1e-6)
+    assert short.steps == 100  # looked at each hundredth
+    with pytest.raises(ValueError, match="minutes"):
+        soak("long_jump", "mujoco", worlds=3, minutes=0.0)
+
+
 def test_a_soak_counts_what_goes_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A task that gives NaN in one of its features now and then, and a reward that is infinite."""
     from sports import long_jump, registry
