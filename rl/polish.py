@@ -18,6 +18,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -53,6 +54,7 @@ WATCHED_EVERY = 7
 """Steps between those whose observations tell how the last hidden layer varies: no divisor of a
 stride."""
 WATCHED_ROWS = 20_000
+GENERATOR_STEP = 1_000_003
 
 
 @dataclass(frozen=True)
@@ -259,28 +261,29 @@ def polish(
             return worth(trials, wanted).reshape(config.blocks, -1).mean(1), trials
 
         names = [f"metrics/{name}" for name in env.metric_names]
-        log = RunLog(out, [*COLUMNS, *names], search.generation, quiet)
-        began = time.monotonic()
-        while not config.over(search.generation, spent.minutes):
-            values, trials = search.advance(judge)
-            now = time.monotonic()
-            spent.minutes, began = spent.minutes + (now - began) / 60.0, now
-            spent.samples += int(trials["episode_steps"].sum())
-            _save(config, out, policy, directions, search, found, spent)
-            rows.append(
-                {
-                    "iteration": search.generation,
-                    "samples": spent.samples,
-                    "minutes": spent.minutes,
-                    "episodes": search.generation * share.trials,
-                    "middle": float(values[0]),
-                    "candidates": float(values[1:].mean()),
-                    "spread": float(np.exp(np.log(search.spreads).mean())),
-                    **{f"metrics/{name}": _mean(trials[name]) for name in env.metric_names},
-                }
-            )
-            log.write(rows[-1], config.done(search.generation, spent.minutes))
-        log.close()
+        # What went on must not meet the starts of its beginning again.
+        env.generator.manual_seed(GENERATOR_STEP * search.generation + config.seed)
+        with closing(RunLog(out, [*COLUMNS, *names], search.generation, quiet)) as log:
+            began = time.monotonic()
+            while not config.over(search.generation, spent.minutes):
+                values, trials = search.advance(judge)
+                now = time.monotonic()
+                spent.minutes, began = spent.minutes + (now - began) / 60.0, now
+                spent.samples += int(trials["episode_steps"].sum())
+                _save(config, out, policy, directions, search, found, spent)
+                rows.append(
+                    {
+                        "iteration": search.generation,
+                        "samples": spent.samples,
+                        "minutes": spent.minutes,
+                        "episodes": search.generation * share.trials,
+                        "middle": float(values[0]),
+                        "candidates": float(values[1:].mean()),
+                        "spread": float(np.exp(np.log(search.spreads).mean())),
+                        **{f"metrics/{name}": _mean(trials[name]) for name in env.metric_names},
+                    }
+                )
+                log.write(rows[-1], config.done(search.generation, spent.minutes))
     return rows
 
 
