@@ -2,7 +2,8 @@
 
 An actor of 0.7 MB in fp16 takes half of that. Rounding errors are at most 1/254 of the largest
 weight of a row, uniform and independent, so what they do to a neuron's input averages out; what a
-policy comes to with them is measured like that of any other (``evaluate``).
+policy comes to with them is measured like that of any other (``evaluate``). The last layer stays as
+it is: its errors are those of the action, and it is a hundredth of the weights.
 """
 
 from __future__ import annotations
@@ -12,13 +13,16 @@ from torch import Tensor
 
 LEVELS = 127
 SCALE = ".scale"
+LAST = "head."
+"""First part of the names of an actor's last layer."""
 
 
 def packed(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Matrices (M, N) as int8, with ``NAME.scale`` (M,) in float32; whatever else as it is."""
+    """Matrices (M, N) but the last layer's as int8, with ``NAME.scale`` (M,) in float32; whatever
+    else as it is."""
     out: dict[str, Tensor] = {}
     for name, weight in weights.items():
-        if weight.dim() != 2:
+        if weight.dim() != 2 or name.startswith(LAST):
             out[name] = weight
             continue
         rows = weight.float()
