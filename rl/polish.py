@@ -28,6 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rl import provenance
 from rl.directions import (
     Directions,
     Phases,
@@ -374,10 +375,11 @@ def _save(
     """Writes the middle as a policy, then the search."""
     middle = directions.at(torch.from_numpy(search.middle))
     episodes = search.generation * config.blocks * config.episodes
+    told = {"episodes": episodes, "commit": provenance.commit(), "hardware": provenance.hardware()}
     card = {
         **policy.metadata,
         "precision": "float16",
-        "polish": {**_about(config, policy), "episodes": episodes},
+        "polish": _about(config, policy) | told,
         "metrics": {},
     }
     write_policy(packed_weights(moved(middle, "cpu")), card, out / POLICY)
