@@ -56,6 +56,8 @@ WATCHED_EVERY = 7
 stride."""
 WATCHED_ROWS = 20_000
 GENERATOR_STEP = 1_000_003
+SEED_OFFSET = 500_009
+"""Added to the seed of the starts, so that those of an evaluation with the same seed are others."""
 
 
 @dataclass(frozen=True)
@@ -263,7 +265,7 @@ def polish(
 
         names = [f"metrics/{name}" for name in env.metric_names]
         # What went on must not meet the starts of its beginning again.
-        env.generator.manual_seed(GENERATOR_STEP * search.generation + config.seed)
+        env.generator.manual_seed(GENERATOR_STEP * search.generation + share.seed)
         with closing(RunLog(out, [*COLUMNS, *names], search.generation, quiet)) as log:
             began = time.monotonic()
             while not config.over(search.generation, spent.minutes):
@@ -296,7 +298,7 @@ def _share(config: Polishing, policy: Policy, options: dict[str, Any] | None) ->
         engine=config.engine,
         trials=config.blocks * config.episodes,
         worlds=config.blocks * config.episodes,
-        seed=config.seed,
+        seed=config.seed + SEED_OFFSET,
         strength=athlete.strength,
         limits=athlete.limits,
         options=athlete.options,
