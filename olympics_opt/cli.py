@@ -23,6 +23,8 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
+from rl.polish_config import Polish
+
 Name = Annotated[str, arg(metavar="NAME")]
 
 
@@ -339,55 +341,6 @@ class Match:
     """Strength of the athletes; by default the one the first policy was trained with."""
     limits: Literal["paper", "anatomical"] | None = None
     """Joint ranges; by default those the first policy was trained with."""
-
-
-@dataclass(frozen=True)
-class Polish:
-    """Make a trained policy better by whole episodes, without rewards for single steps.
-
-    CMA-ES moves its weights a little, along a few directions, and keeps what its episodes come to:
-    what PPO cannot tell from its noise. Writes policy.safetensors after every generation; the
-    same command goes on where one was stopped.
-    """
-
-    name: Positional[Annotated[str, arg(metavar="TASK")]]
-    """Sport; see ``olympics-opt list``."""
-    policy: str
-    """A run folder, a policy file, or ``pretrained[:ALGO[-STRENGTH]]``."""
-    out: Path
-    """Folder for the result."""
-    objective: str = ""
-    """What counts, ``METRIC=WEIGHT@ZERO`` each: ``success=1 time=-0.3@18.2`` is a point for success
-    and 0.3 for every second below 18.2. By default the task's main metric."""
-    others: tuple[str, ...] = ()
-    """Policies with the same network, other states of the training as a rule: one direction leads
-    to each."""
-    components: int = 4
-    """Phases of the motion (principal components of the last hidden layer) in step with which
-    every action may shift; -1 for no shifts at all."""
-    candidates: int = 23
-    """Policies of a generation, besides the middle that they are drawn around."""
-    episodes: int = 24
-    """Of each candidate in a generation."""
-    generations: int | None = None
-    """By default as many as the minutes allow."""
-    minutes: float | None = None
-    """Time limit; the generation under way is finished."""
-    shift: float = 0.004
-    """First spread of each shift (root mean square of the action; 1 is its bound)."""
-    share: float = 0.2
-    """First spread of the way to each other policy."""
-    start_noise: float = 0.02
-    """+- joint noise of the starts (rad). More than the 0.02 of an evaluation tells more about what
-    hardly ever fails."""
-    engine: Literal["mujoco", "warp", "drake"] = "mujoco"
-    """Physics engine; ``warp`` needs a GPU."""
-    seed: int = 0
-    """Seed of all randomness."""
-    strength: Literal["paper", "human"] | None = None
-    """Strength of the athlete; by default the one the policy was trained with."""
-    limits: Literal["paper", "anatomical"] | None = None
-    """Joint ranges; by default those the policy was trained with."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from olympics_opt.meter import device_name, resident_gib
-from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
+from rl.checkpoint import checkpoints, load_checkpoint, save_checkpoint
 from sports.env import Env, make_env
 
 STEPS = 10_000
@@ -127,10 +127,7 @@ def soak(
         actions = SIGMA * torch.randn(shape, generator=generator, device=env.device)
         _play(env, actions, tally, steps, minutes, on_step)
         if keep is not None:
-            try:
-                save_checkpoint(keep, tally.step, {"soak": about | asdict(tally)}, env.state_dict())
-            except OSError as error:
-                raise CheckpointError(f"'{keep}' cannot be written: {error}") from error
+            save_checkpoint(keep, tally.step, {"soak": about | asdict(tally)}, env.state_dict())
         late = _device_gib(env)
         return Soak(
             task=task,
@@ -180,13 +177,10 @@ def _play(
     on_step: Callable[[int], None] | None,
 ) -> None:
     """Plays until ``steps`` and adds to the tally."""
-    before = (tally.nan_worlds, tally.overflow, dict(tally.overflows))
     # Of numbers: not finite in features and rewards; of worlds: ended.
     counts = torch.zeros(3, dtype=torch.long, device=env.device)
     largest = torch.zeros(2, device=env.device)
-    early, mark, began = max(1, steps // 100), max(1, steps // 100), time.perf_counter()
-    if tally.step == 0:
-        tally.early_gib = _device_gib(env)
+    mark, began = max(1, steps // 100), time.perf_counter()
     while tally.step < steps:
         result = env.step(actions[tally.step % len(actions)])
         # The environment removes NaN from its observations; here they are looked for.
@@ -201,7 +195,7 @@ def _play(
         sizes = torch.stack((result.obs.abs().amax(), result.reward.abs().amax()))
         largest = torch.maximum(largest, sizes)
         tally.step += 1
-        if tally.step == early:
+        if tally.step == mark:
             tally.early_gib = _device_gib(env)
         if tally.step % mark == 0:
             if on_step is not None:
@@ -216,10 +210,9 @@ def _play(
     sizes = largest.tolist()
     tally.largest_observation = max(tally.largest_observation, sizes[0])
     tally.largest_reward = max(tally.largest_reward, sizes[1])
-    tally.nan_worlds = before[0] + int(env.physics.nan_worlds)
-    tally.overflow = before[1] + int(env.physics.overflow)
-    found = Counter(before[2]) + Counter(env.physics.overflows())
-    tally.overflows = dict(found)
+    tally.nan_worlds += int(env.physics.nan_worlds)
+    tally.overflow += int(env.physics.overflow)
+    tally.overflows = dict(Counter(tally.overflows) + Counter(env.physics.overflows()))
     tally.seconds += time.perf_counter() - began
 
 

@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_safetensors
@@ -23,6 +21,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from rl import pretrained
+from rl.card import card_text
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.int8 import packed, unpacked
 from rl.latent_action import LatentActions, LatentConfig
@@ -440,14 +439,3 @@ def write_policy(data: bytes, card: dict[str, Any], out: Path | str) -> Path:
     write_bytes(path, data)
     write_text(path.with_suffix(".json"), card_text(card))
     return path
-
-
-def card_text(card: dict[str, Any]) -> str:
-    """A card as JSON: the statistics in as many digits as their float32 has, and each list of
-    numbers on one line. Raises ValueError for numbers that are not finite."""
-    short = dict(card)
-    for name in ("obs_mean", "obs_std"):
-        if name in card:
-            short[name] = [float(str(np.float32(x))) for x in card[name]]
-    text = json.dumps(short, indent=1, allow_nan=False)
-    return re.sub(r"\[[-+.\deE,\s]+\]", lambda found: " ".join(found[0].split()), text)

@@ -20,10 +20,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
-import cma
 import numpy as np
 import torch
 from torch import Tensor
@@ -42,11 +40,12 @@ from rl.directions import (
 )
 from rl.policy import Policy, as_trained, load_policy, packed_weights, write_policy
 from rl.policy_stack import PolicyStack
+from rl.polish_config import Polish
 from rl.runlog import Row, RunLog
 from rl.trials import Share, opened, play_episodes
 from sports.env import Env
 from sports.registry import get_task
-from sports.starts import START_NOISE
+from warmstart.evolution import strategy
 from warmstart.npz import read_npz, write_npz
 
 T = TypeVar("T")
@@ -58,64 +57,6 @@ WATCHED_ROWS = 20_000
 GENERATOR_STEP = 1_000_003
 SEED_OFFSET = 500_009
 """Added to the seed of the starts, so that those of an evaluation with the same seed are others."""
-
-
-@dataclass(frozen=True)
-class Polishing:
-    """What is searched, and how long."""
-
-    task: str
-    policy: str
-    others: tuple[str, ...] = ()
-    """Policies with the same network: one direction leads to each."""
-    components: int = 4
-    """Principal components of the last hidden layer with which actions shift; -1 for no shifts."""
-    objective: str = ""
-    """See ``aims``; the task's main metric where empty."""
-    candidates: int = 23
-    """C."""
-    episodes: int = 24
-    """E."""
-    generations: int | None = None
-    """None: as many as the minutes allow."""
-    minutes: float | None = None
-    shift: float = 0.004
-    """First spread of each shift (root mean square of the action, 1 = its bound)."""
-    share: float = 0.2
-    """First spread of the way to each other policy."""
-    start_noise: float = START_NOISE
-    """+- joint noise of the starts (rad); more of it than in an evaluation tells more about what
-    hardly ever fails."""
-    seed: int = 0
-    engine: str = "mujoco"
-    strength: str | None = None
-    limits: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.candidates < 4 or self.episodes < 1:
-            raise ValueError("a search needs at least 4 candidates with 1 episode each")
-        if self.components < -1 or (self.components < 0 and not self.others):
-            raise ValueError("nothing to search: give components >= 0 or other policies")
-        if not 0.0 <= self.start_noise < 1.0:
-            raise ValueError(f"the starts' noise must lie in [0, 1) rad, not {self.start_noise}")
-        if self.shift <= 0.0 or self.share <= 0.0:
-            raise ValueError("the first spreads must be positive")
-        if self.generations is None and self.minutes is None:
-            raise ValueError("say for how many generations or minutes to search")
-
-    @property
-    def blocks(self) -> int:
-        """The middle and its candidates."""
-        return 1 + self.candidates
-
-    def done(self, generation: int, minutes: float) -> float:
-        """The share of the search that is done after so many, 0 to 1."""
-        shares = ((generation, self.generations), (minutes, self.minutes))
-        return min(1.0, max((n / of if of else 1.0) for n, of in shares if of is not None))
-
-    def over(self, generation: int, minutes: float) -> bool:
-        """Whether the search is done."""
-        return self.done(generation, minutes) >= 1.0
 
 
 @dataclass(frozen=True)
@@ -196,16 +137,15 @@ class Search:
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng((self.seed, self.generation))
-        options = {
-            "popsize": self.candidates,
-            "CMA_diagonal": True,
-            "CMA_stds": self.spreads,
-            "randn": lambda *shape: self._rng.standard_normal(shape),
-            "seed": np.nan,  # leaves NumPy's own generator alone
-            "verbose": -9,
-            "maxiter": np.inf,
-        }
-        self._strategy = cma.CMAEvolutionStrategy(self.middle, 1.0, options)
+        self._strategy = strategy(
+            self.middle,
+            1.0,
+            self.candidates,
+            lambda: self._rng,
+            CMA_diagonal=True,
+            CMA_stds=self.spreads,
+            maxiter=np.inf,
+        )
 
     def advance(self, judge: Callable[[np.ndarray], tuple[np.ndarray, T]]) -> tuple[np.ndarray, T]:
         """One generation; ``judge`` maps the middle and the candidates (1 + C, K) to their worth
@@ -235,23 +175,21 @@ the candidates were drawn around, ``candidates`` the mean of theirs, ``spread`` 
 of the spreads in units of the first; metrics are means over all episodes of the generation."""
 
 
-def polish(
-    config: Polishing, out: Path, options: dict[str, Any] | None = None, quiet: bool = False
-) -> list[Row]:
-    """Searches; after every generation writes ``out/policy.safetensors``, the middle, and a row of
-    ``out/progress.csv``, and shows it unless ``quiet``.
+def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = False) -> list[Row]:
+    """Searches; after every generation writes the middle, ``policy.safetensors``, and a row of
+    ``progress.csv`` into the folder, and shows it unless ``quiet``.
 
     The same call goes on where one was stopped. ``options`` are the task's. Returns the rows of
     this call. Raises PolicyError and ValueError for what does not fit, before anything is written.
     """
-    wanted = aims(config.objective, config.task)
-    policy = load_policy(config.policy, config.task)
+    wanted = aims(config.objective, config.name)
+    policy = load_policy(config.policy, config.name)
     weights_of(policy)  # a baseline has none
-    ways = [towards(policy, load_policy(name, config.task)) for name in config.others]
+    ways = [towards(policy, load_policy(name, config.name)) for name in config.others]
     share = _share(config, policy, options)
     rows: list[Row] = []
     with opened(policy, share) as env:
-        search, found, spent = _begin(config, out, policy, lambda: watched(policy, share, env))
+        search, found, spent = _begin(config, policy, lambda: watched(policy, share, env))
         changes = [moved(scaled(way, config.share), env.device) for way in ways]
         if found is not None:
             changes += shifts(policy, found, config.shift)
@@ -266,14 +204,14 @@ def polish(
         names = [f"metrics/{name}" for name in env.metric_names]
         # What went on must not meet the starts of its beginning again.
         env.generator.manual_seed(GENERATOR_STEP * search.generation + share.seed)
-        with closing(RunLog(out, [*COLUMNS, *names], search.generation, quiet)) as log:
+        with closing(RunLog(config.out, [*COLUMNS, *names], search.generation, quiet)) as log:
             began = time.monotonic()
             while not config.over(search.generation, spent.minutes):
                 values, trials = search.advance(judge)
                 now = time.monotonic()
                 spent.minutes, began = spent.minutes + (now - began) / 60.0, now
                 spent.samples += int(trials["episode_steps"].sum())
-                _save(config, out, policy, directions, search, found, spent)
+                _save(config, policy, directions, search, found, spent)
                 rows.append(
                     {
                         "iteration": search.generation,
@@ -290,11 +228,11 @@ def polish(
     return rows
 
 
-def _share(config: Polishing, policy: Policy, options: dict[str, Any] | None) -> Share:
+def _share(config: Polish, policy: Policy, options: dict[str, Any] | None) -> Share:
     """The episodes of a generation."""
-    athlete = as_trained(policy, config.task, config.strength, config.limits, options)
+    athlete = as_trained(policy, config.name, config.strength, config.limits, options)
     return Share(
-        task=config.task,
+        task=config.name,
         engine=config.engine,
         trials=config.blocks * config.episodes,
         worlds=config.blocks * config.episodes,
@@ -333,17 +271,17 @@ def watched(policy: Policy, share: Share, env: Env) -> Tensor:
 
 
 def _begin(
-    config: Polishing, out: Path, policy: Policy, watch: Callable[[], Tensor]
+    config: Polish, policy: Policy, watch: Callable[[], Tensor]
 ) -> tuple[Search, Phases | None, Spent]:
     """A new search with the phases that it shifts actions in, or what ``out`` holds of one. Raises
     ValueError for another one's."""
-    path = out / STATE
+    path = config.out / STATE
     device = policy.mean.device
     if path.exists():
         needed = ("middle", "spreads")
         arrays, meta = read_npz(path, needed, ("phase_middle", "phase_axes"), what="search")
         if meta.get("about") != _about(config, policy):
-            raise ValueError(f"'{out}' holds another search: give another folder")
+            raise ValueError(f"'{config.out}' holds another search: give another folder")
         kept = [arrays.get(name) for name in ("phase_middle", "phase_axes")]
         found = None
         if kept[0] is not None and kept[1] is not None:
@@ -358,7 +296,7 @@ def _begin(
     return Search(middle, spreads, config.candidates, config.seed, generation), found, spent
 
 
-def _about(config: Polishing, policy: Policy) -> dict[str, Any]:
+def _about(config: Polish, policy: Policy) -> dict[str, Any]:
     """What a search that goes on must have been about."""
     names = ("others", "components", "objective", "shift", "share")
     said = {name: getattr(config, name) for name in names}
@@ -366,8 +304,7 @@ def _about(config: Polishing, policy: Policy) -> dict[str, Any]:
 
 
 def _save(
-    config: Polishing,
-    out: Path,
+    config: Polish,
     policy: Policy,
     directions: Directions,
     search: Search,
@@ -384,7 +321,7 @@ def _save(
         "polish": _about(config, policy) | told,
         "metrics": {},
     }
-    write_policy(packed_weights(moved(middle, "cpu")), card, out / POLICY)
+    write_policy(packed_weights(moved(middle, "cpu")), card, config.out / POLICY)
     arrays = {"middle": search.middle, "spreads": search.spreads}
     if found is not None:
         arrays |= {
@@ -392,4 +329,4 @@ def _save(
             "phase_axes": found.axes.cpu().numpy(),
         }
     meta = {"about": _about(config, policy), "generation": search.generation}
-    write_npz(out / STATE, arrays, meta | asdict(spent))
+    write_npz(config.out / STATE, arrays, meta | asdict(spent))

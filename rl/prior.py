@@ -25,6 +25,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from rl import pretrained
+from rl.card import card_text
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.networks import MLP
 from rl.prior_pose import PosePart
@@ -278,7 +279,7 @@ def save_prior(prior: LatentPrior, out: Path | str, *, half: bool, encoder: bool
     path = Path(out).with_suffix(".safetensors")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, data)
-    write_text(path.with_suffix(".json"), json.dumps(card, indent=1, allow_nan=False))
+    write_text(path.with_suffix(".json"), card_text(card))
     return path
 
 

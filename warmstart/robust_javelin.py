@@ -22,7 +22,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cma
 import numpy as np
 import torch
 
@@ -30,6 +29,7 @@ from sports.humanoid.body import Strength
 from sports.scene import Scene
 from sports.starts import START_NOISE, loose_joints
 from warmstart.clip import Clip
+from warmstart.evolution import strategy
 from warmstart.javelin_throw import UNITS, WATCHED, Flown, Thrower, size_of, throw
 from warmstart.other_worlds import FIRM, Other, OtherWorlds
 from warmstart.performance import numbers_near
@@ -108,13 +108,7 @@ def search(
     crowd = Crowd(strength, settings.candidates, threads)
     rng = np.random.default_rng(settings.seed)
     start = np.zeros(len(UNITS)) if near is None else near
-    options = {
-        "popsize": settings.candidates,
-        "randn": lambda *shape: rng.standard_normal(shape),
-        "seed": np.nan,  # leaves NumPy's own generator alone
-        "verbose": -9,
-    }
-    sought = cma.CMAEvolutionStrategy(start, settings.spread, options)
+    sought = strategy(start, settings.spread, settings.candidates, lambda: rng)
     clip = None
     for done in range(1, settings.rounds + 1):
         asked, middle = np.array(sought.ask()), np.array(sought.mean)

@@ -13,7 +13,8 @@ import torch
 from rl.directions import Directions, phases, scaled, shifts, towards, weights_of
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError, load_policy
-from rl.polish import Aim, Crowd, Polishing, Search, aims, polish, worth
+from rl.polish import Aim, Crowd, Search, aims, polish, worth
+from rl.polish_config import Polish
 from rl.runlog import read_progress
 
 D, H, U = 6, 5, 3
@@ -119,9 +120,10 @@ def test_aims_are_read_and_paid():
             aims(text, "hurdling")
 
 
-CONFIG = Polishing(
-    task="long_jump",
+CONFIG = Polish(
+    name="long_jump",
     policy="pretrained",
+    out=Path("unused"),
     components=1,
     objective="length=1",
     candidates=4,
@@ -131,7 +133,7 @@ CONFIG = Polishing(
 
 
 def test_a_search_that_was_stopped_goes_on_and_its_middle_is_what_was_written(tmp_path: Path):
-    told = polish(CONFIG, tmp_path / "whole", quiet=True)
+    told = polish(replace(CONFIG, out=tmp_path / "whole"), quiet=True)
     assert [row["iteration"] for row in told] == [1, 2]
     assert told[-1]["episodes"] == 2 * 5 and np.isfinite(float(told[-1]["middle"] or np.nan))
     for row, read in zip(told, read_progress(tmp_path / "whole"), strict=True):
@@ -144,16 +146,17 @@ def test_a_search_that_was_stopped_goes_on_and_its_middle_is_what_was_written(tm
     same = weights_of(own)["trunk.0.weight"]
     torch.testing.assert_close(weights_of(written)["trunk.0.weight"], same, atol=1e-4, rtol=2e-3)
 
-    polish(replace(CONFIG, generations=1), tmp_path / "parts", quiet=True)
-    assert [row["iteration"] for row in polish(CONFIG, tmp_path / "parts", quiet=True)] == [2]
-    assert polish(CONFIG, tmp_path / "parts", quiet=True) == []  # nothing left to do
+    parts = replace(CONFIG, out=tmp_path / "parts")
+    polish(replace(parts, generations=1), quiet=True)
+    assert [row["iteration"] for row in polish(parts, quiet=True)] == [2]
+    assert polish(parts, quiet=True) == []  # nothing left to do
     kept = read_progress(tmp_path / "parts")
     assert [row["iteration"] for row in kept] == [1, 2]
     assert kept[0]["samples"] == told[0]["samples"]
     for name in ("samples", "minutes"):
         assert float(kept[1][name] or 0) > float(kept[0][name] or 0) > 0, name
     with pytest.raises(ValueError, match="another search"):
-        polish(replace(CONFIG, shift=0.1), tmp_path / "parts")
+        polish(replace(parts, shift=0.1))
 
 
 def test_mistakes_are_told_before_anything_is_played(tmp_path: Path):
@@ -167,9 +170,9 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path):
         with pytest.raises(ValueError, match=said):
             replace(CONFIG, **change)
     with pytest.raises(PolicyError, match="baseline"):
-        polish(replace(CONFIG, policy="zero"), tmp_path)
+        polish(replace(CONFIG, policy="zero", out=tmp_path))
     with pytest.raises(PolicyError, match="not of 'long_jump'"):
-        polish(replace(CONFIG, policy=shipped("high_jump")), tmp_path)
+        polish(replace(CONFIG, policy=shipped("high_jump"), out=tmp_path))
     assert not list(tmp_path.iterdir())
 
 

@@ -1,0 +1,84 @@
+"""What ``olympics-opt polish`` is told. Light to import."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+
+@dataclass(frozen=True)
+class Polish:
+    """Make a trained policy better by whole episodes, without rewards for single steps.
+
+    CMA-ES moves its weights a little, along a few directions, and keeps what its episodes come to:
+    what PPO cannot tell from its noise. Writes policy.safetensors after every generation; the
+    same command goes on where one was stopped.
+    """
+
+    name: Positional[Annotated[str, arg(metavar="TASK")]]
+    """Sport; see ``olympics-opt list``."""
+    policy: str
+    """A run folder, a policy file, or ``pretrained[:ALGO[-STRENGTH]]``."""
+    out: Path
+    """Folder for the result."""
+    objective: str = ""
+    """What counts, ``METRIC=WEIGHT@ZERO`` each: ``success=1 time=-0.3@18.2`` is a point for success
+    and 0.3 for every second below 18.2. By default the task's main metric."""
+    others: tuple[str, ...] = ()
+    """Policies with the same network, other states of the training as a rule: one direction leads
+    to each."""
+    components: int = 4
+    """Phases of the motion (principal components of the last hidden layer) in step with which
+    every action may shift; -1 for no shifts at all."""
+    candidates: int = 23
+    """Policies of a generation, besides the middle that they are drawn around."""
+    episodes: int = 24
+    """Of each candidate in a generation."""
+    generations: int | None = None
+    """By default as many as the minutes allow."""
+    minutes: float | None = None
+    """Time limit; the generation under way is finished."""
+    shift: float = 0.004
+    """First spread of each shift (root mean square of the action; 1 is its bound)."""
+    share: float = 0.2
+    """First spread of the way to each other policy."""
+    start_noise: float = 0.02
+    """+- joint noise of the starts (rad). More than the 0.02 of an evaluation tells more about what
+    hardly ever fails."""
+    engine: Literal["mujoco", "warp", "drake"] = "mujoco"
+    """Physics engine; ``warp`` needs a GPU."""
+    seed: int = 0
+    """Seed of all randomness."""
+    strength: Literal["paper", "human"] | None = None
+    """Strength of the athlete; by default the one the policy was trained with."""
+    limits: Literal["paper", "anatomical"] | None = None
+    """Joint ranges; by default those the policy was trained with."""
+
+    def __post_init__(self) -> None:
+        if self.candidates < 4 or self.episodes < 1:
+            raise ValueError("a search needs at least 4 candidates with 1 episode each")
+        if self.components < -1 or (self.components < 0 and not self.others):
+            raise ValueError("nothing to search: give components >= 0 or other policies")
+        if not 0.0 <= self.start_noise < 1.0:
+            raise ValueError(f"the starts' noise must lie in [0, 1) rad, not {self.start_noise}")
+        if self.shift <= 0.0 or self.share <= 0.0:
+            raise ValueError("the first spreads must be positive")
+        if self.generations is None and self.minutes is None:
+            raise ValueError("say for how many generations or minutes to search")
+
+    @property
+    def blocks(self) -> int:
+        """The middle and its candidates."""
+        return 1 + self.candidates
+
+    def done(self, generation: int, minutes: float) -> float:
+        """The share of the search that is done after so many, 0 to 1."""
+        shares = ((generation, self.generations), (minutes, self.minutes))
+        return min(1.0, max((n / of if of else 1.0) for n, of in shares if of is not None))
+
+    def over(self, generation: int, minutes: float) -> bool:
+        """Whether the search is done."""
+        return self.done(generation, minutes) >= 1.0
