@@ -33,6 +33,7 @@ from rl.ppo import PPO, STATISTICS
 from rl.ranks import own_rank
 from rl.rollout import Actor, Rollout
 from rl.warm_start import load_start
+from rl.worlds import engine_options
 from sports.env import Env, Starts, make_env
 
 MakeEnv = Callable[[TrainConfig, int], Any]
@@ -167,11 +168,7 @@ def default_env(config: TrainConfig, seed: int) -> Env:
     if config.engine == "mujoco" and local_ranks() > 1:
         each = max(1, (os.cpu_count() or 1) // local_ranks())
         physics_options = {"threads": each} | physics_options
-    if config.felt_damping:
-        physics_options |= {"felt_damping": True}
-    if config.vary:
-        variation = replace(config.variation, own_stride=config.timestep_divisor)
-        physics_options |= {"variation": variation, "variation_seed": seed}
+    physics_options |= engine_options(config, seed)
     if config.task == PRIOR:
         from rl.distillation import make_distillation_env
 

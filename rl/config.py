@@ -16,6 +16,7 @@ from rl.latent_action import LatentConfig
 from rl.ppo import PAPER, PPOConfig
 from rl.selfplay import SelfPlayConfig
 from rl.steady import BALANCE
+from rl.worlds import mistakes as world_mistakes
 from sports.env import Starts
 from sports.physics.variation import Variation
 from sports.registry import get_task, task_names
@@ -191,12 +192,7 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
         yield "impact and impact_limit must not be negative"
     if not all(0.0 <= p <= 1.0 for p in c.start_probability):
         yield f"start_probability must lie in [0, 1], not {c.start_probability}"
-    if c.variation != Variation() and not c.vary:
-        yield "the --variation options are of worlds that vary: give --vary as well"
-    if c.variation.own_stride != 1:
-        yield "own-stride is the timestep-divisor: leave --variation.own-stride out"
-    if c.variation.own_share and c.felt_damping:
-        yield "own worlds do not feel damping: leave --variation.own-share or --felt-damping out"
+    yield from world_mistakes(c)
     if c.clone < 0:
         yield f"clone must not be negative: {c.clone}"
 

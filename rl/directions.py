@@ -100,12 +100,15 @@ def phases(policy: Policy, obs: Tensor, components: int) -> Phases:
     return Phases(middle.float(), (axes[:components] * scale).float())
 
 
-def shifts(policy: Policy, found: Phases, unit: float) -> list[Weights]:
-    """U (1 + P) changes of the last layer that move one action each: by ``unit`` always, or by
-    ``unit`` times a component: more of it in one phase of the motion and less in another."""
+def shifts(
+    policy: Policy, found: Phases, unit: float, actions: Sequence[int] | None = None
+) -> list[Weights]:
+    """U (1 + P) changes of the last layer that move one action each, of all or of these: by
+    ``unit`` always, or by ``unit`` times a component: more of it in one phase of the motion and
+    less in another."""
     assert policy.actor is not None
     changes: list[Weights] = []
-    for action in range(policy.actor.head.out_features):
+    for action in range(policy.actor.head.out_features) if actions is None else actions:
         one = torch.zeros_like(policy.actor.head.bias)
         one[action] = unit
         changes.append({"head.bias": one})

@@ -14,6 +14,7 @@ Shapes: C candidates besides the middle, E episodes of each, K directions.
 
 from __future__ import annotations
 
+import fnmatch
 import json
 import math
 import time
@@ -43,7 +44,9 @@ from rl.policy_stack import PolicyStack
 from rl.polish_config import Polish
 from rl.runlog import Row, RunLog
 from rl.trials import Share, opened, play_episodes
+from rl.worlds import engine_options
 from sports.env import Env
+from sports.humanoid.body import load_body
 from sports.registry import get_task
 from warmstart.evolution import strategy
 from warmstart.npz import read_npz, write_npz
@@ -192,7 +195,7 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
         search, found, spent = _begin(config, policy, lambda: watched(policy, share, env))
         changes = [moved(scaled(way, config.share), env.device) for way in ways]
         if found is not None:
-            changes += shifts(policy, found, config.shift)
+            changes += shifts(policy, found, config.shift, _actions(config, policy))
         directions, crowd = Directions(weights_of(policy), changes), Crowd(policy, config.blocks)
 
         def judge(numbers: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -231,6 +234,9 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
 def _share(config: Polish, policy: Policy, options: dict[str, Any] | None) -> Share:
     """The episodes of a generation."""
     athlete = as_trained(policy, config.name, config.strength, config.limits, options)
+    physics = engine_options(config, config.seed)
+    if config.vary:
+        physics["variation_blocks"] = config.blocks
     return Share(
         task=config.name,
         engine=config.engine,
@@ -240,12 +246,29 @@ def _share(config: Polish, policy: Policy, options: dict[str, Any] | None) -> Sh
         strength=athlete.strength,
         limits=athlete.limits,
         options=athlete.options,
-        physics_options={},
-        timestep_divisor=1,
+        physics_options=physics,
+        timestep_divisor=config.timestep_divisor,
         start_noise=config.start_noise,
         record=False,
         worlds_recorded=(),
+        blocks=config.blocks,
     )
+
+
+def _actions(config: Polish, policy: Policy) -> list[int]:
+    """The actions to be shifted. Raises ValueError for joints that there are not."""
+    size = int(policy.metadata["action_size"])
+    if not config.joints:
+        return list(range(size))
+    if policy.prior is not None:
+        raise ValueError("a policy in latents does not move single joints: leave --joints out")
+    body = load_body(get_task(config.name).body)
+    names = [dof.name for dof in body.dofs]
+    for pattern in config.joints:
+        if not fnmatch.filter(names, pattern):
+            raise ValueError(f"no joint is called '{pattern}'; there are {', '.join(names)}")
+    chosen = {name for pattern in config.joints for name in fnmatch.filter(names, pattern)}
+    return [i for i, name in enumerate(names) if name in chosen]
 
 
 def _mean(values: np.ndarray) -> float | None:
@@ -290,15 +313,14 @@ def _begin(
         spent = Spent(float(meta["minutes"]), int(meta["samples"]))
     else:
         found = None if config.components < 0 else phases(policy, watch(), config.components)
-        actions = int(policy.metadata["action_size"])
-        size = len(config.others) + actions * (1 + config.components)
+        size = len(config.others) + len(_actions(config, policy)) * (1 + config.components)
         middle, spreads, generation, spent = np.zeros(size), np.ones(size), 0, Spent()
     return Search(middle, spreads, config.candidates, config.seed, generation), found, spent
 
 
 def _about(config: Polish, policy: Policy) -> dict[str, Any]:
     """What a search that goes on must have been about."""
-    names = ("others", "components", "objective", "shift", "share")
+    names = ("others", "components", "joints", "objective", "shift", "share")
     said = {name: getattr(config, name) for name in names}
     return json.loads(json.dumps(said | {"of": policy.metadata["sha256"]}))
 

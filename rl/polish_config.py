@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
+
+from rl.worlds import mistakes as world_mistakes
+from sports.physics.variation import Variation
 
 
 @dataclass(frozen=True)
@@ -33,10 +36,14 @@ class Polish:
     components: int = 4
     """Phases of the motion (principal components of the last hidden layer) in step with which
     every action may shift; -1 for no shifts at all."""
+    joints: tuple[str, ...] = ()
+    """Shift these alone, by name (``R_Shoulder_*``, ``Torso_?``); by default every action. What a
+    throw needs is in the trunk and one arm, not in 153 joints."""
     candidates: int = 23
     """Policies of a generation, besides the middle that they are drawn around."""
     episodes: int = 24
-    """Of each candidate in a generation."""
+    """Of each candidate in a generation; all have the same starts, and the same worlds with
+    ``vary``."""
     generations: int | None = None
     """By default as many as the minutes allow."""
     minutes: float | None = None
@@ -50,6 +57,15 @@ class Polish:
     hardly ever fails."""
     engine: Literal["mujoco", "warp", "drake"] = "mujoco"
     """Physics engine; ``warp`` needs a GPU."""
+    timestep_divisor: int = 1
+    """2 halves the physics time step at the same control rate."""
+    felt_damping: bool = False
+    """Contacts feel the joints' damping, as in Drake (docs/physics.md)."""
+    vary: bool = False
+    """Let the worlds of a candidate differ, as ``train --vary`` does: what counts is then what the
+    policy is worth in all of them."""
+    variation: Variation = field(default_factory=Variation)
+    """How, with ``--vary``: ranges and shares of worlds."""
     seed: int = 0
     """Seed of all randomness."""
     strength: Literal["paper", "human"] | None = None
@@ -66,6 +82,12 @@ class Polish:
             raise ValueError(f"the starts' noise must lie in [0, 1) rad, not {self.start_noise}")
         if self.shift <= 0.0 or self.share <= 0.0:
             raise ValueError("the first spreads must be positive")
+        if self.joints and self.components < 0:
+            raise ValueError("no action is shifted with components -1: leave --joints out")
+        if self.engine == "drake" and (self.vary or self.felt_damping):
+            raise ValueError("in drake no worlds vary and all contacts feel the damping")
+        for mistake in world_mistakes(self):
+            raise ValueError(mistake)
         if self.generations is None and self.minutes is None:
             raise ValueError("say for how many generations or minutes to search")
 

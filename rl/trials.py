@@ -47,6 +47,8 @@ class Share:
     """Keep what may turn out to be the best or the median."""
     worlds_recorded: tuple[int, ...]
     """Whose first episodes are kept."""
+    blocks: int = 1
+    """Worlds in so many blocks with the same starts."""
 
 
 @dataclass
@@ -92,6 +94,7 @@ def opened(policy: Policy, share: Share) -> Iterator[Env]:
         policy.seed(share.seed)
         if share.start_noise > 0.0:
             env.starts = standing_starts(env, share.start_noise, share.seed)
+            env.starts.blocks = share.blocks
         with one_torch_thread(env.device):
             yield env
     finally:

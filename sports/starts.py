@@ -37,13 +37,19 @@ class Starts:
     they are. None where no frame has any."""
     object_qvel: Tensor | None = None
     """(F, 6 k)"""
+    blocks: int = 1
+    """The worlds come in so many blocks that draw the same frames."""
 
     def to(self, device: torch.device | str) -> Starts:
         """The same frames on a device."""
-        context = {k: v.to(device) for k, v in self.context.items()}
         things = (x if x is None else x.to(device) for x in (self.object_qpos, self.object_qvel))
         return Starts(
-            self.qpos.to(device), self.qvel.to(device), context, self.probability, *things
+            self.qpos.to(device),
+            self.qvel.to(device),
+            {k: v.to(device) for k, v in self.context.items()},
+            self.probability,
+            *things,
+            blocks=self.blocks,
         )
 
     def draw(self, state: PhysicsState, scene: Scene, generator: torch.Generator) -> Memory:
@@ -52,7 +58,8 @@ class Starts:
         Raises ValueError where the frames have another number of objects than the scene.
         """
         device, frames = self.qpos.device, self.qpos.shape[0]
-        draw = torch.rand(state.qpos.shape[0], 2, device=device, generator=generator)
+        each = state.qpos.shape[0] // self.blocks
+        draw = torch.rand(each, 2, device=device, generator=generator).repeat(self.blocks, 1)
         use = draw[:, 0] < self.probability
         frame = (draw[:, 1] * frames).long().clamp(max=frames - 1)
         q, v = scene.agent_qpos(0), scene.agent_qvel(0)

@@ -31,9 +31,11 @@ class MujocoPhysics:
         variation: Variation | None = None,
         variation_seed: int = 0,
         felt_damping: bool = False,
+        variation_blocks: int = 1,
     ) -> None:
         """``threads``: 0 for all cores. ``variation``: let the worlds differ. ``felt_damping``: let
-        contacts feel the joints' damping, on firm ground (``sports.physics.variation``)."""
+        contacts feel the joints' damping, on firm ground (``sports.physics.variation``).
+        ``variation_blocks``: the worlds differ alike in each of so many blocks."""
         self.scene = scene
         self.num_worlds = n = num_worlds
         self.threads = threads = threads or os.cpu_count() or 1
@@ -43,7 +45,9 @@ class MujocoPhysics:
         self.geometry = CompiledGeometry(scene.body, self.device)
         drawn = None
         if variation is not None:
-            drawn = draw(variation, n, scene.substeps, variation_seed, felt_damping)
+            drawn = draw(
+                variation, n, scene.substeps, variation_seed, felt_damping, variation_blocks
+            )
         elif felt_damping:
             firm_ground(model)
         self._out = out = Results(scene, n)

@@ -133,11 +133,22 @@ class Draw:
 
 
 def draw(
-    variation: Variation, num_worlds: int, substeps: int, seed: int, all_felt: bool = False
+    variation: Variation,
+    num_worlds: int,
+    substeps: int,
+    seed: int,
+    all_felt: bool = False,
+    blocks: int = 1,
 ) -> Draw:
     """One draw for each world of a scene with so many substeps in a control step. ``all_felt``:
-    with felt damping, whatever the share, and none of them the task's own. Raises ValueError for an
-    ``own_stride`` that does not divide the substeps."""
+    with felt damping, whatever the share, and none of them the task's own. ``blocks``: the worlds
+    come in so many blocks that are alike, for policies to be compared in. Raises ValueError for an
+    ``own_stride`` that does not divide the substeps, or blocks that do not divide the worlds."""
+    if num_worlds % blocks:
+        raise ValueError(f"variation: {blocks} blocks do not divide {num_worlds} worlds")
+    if blocks > 1:
+        one = draw(variation, num_worlds // blocks, substeps, seed, all_felt)
+        return Draw(**{name: np.tile(values, blocks) for name, values in vars(one).items()})
     if substeps % variation.own_stride:
         raise ValueError(
             f"variation: own_stride {variation.own_stride} does not divide {substeps} substeps"

@@ -53,10 +53,12 @@ class WarpPhysics:
         variation: Variation | None = None,
         variation_seed: int = 0,
         felt_damping: bool = False,
+        variation_blocks: int = 1,
     ) -> None:
         """``device``: a torch device; None takes the current GPU. ``variation``: let the worlds
         differ. ``felt_damping``: let contacts feel the joints' damping, on firm ground
-        (``sports.physics.variation``). Raises RuntimeError when there is no GPU and ``device`` does
+        (``sports.physics.variation``). ``variation_blocks``: the worlds differ alike in each of so
+        many blocks. Raises RuntimeError when there is no GPU and ``device`` does
         not say ``cpu``."""
         if device is None:
             if not torch.cuda.is_available():
@@ -79,7 +81,14 @@ class WarpPhysics:
             firm_ground(model)
         drawn = None
         if variation is not None:
-            drawn = draw(variation, num_worlds, scene.substeps, variation_seed, felt_damping)
+            drawn = draw(
+                variation,
+                num_worlds,
+                scene.substeps,
+                variation_seed,
+                felt_damping,
+                variation_blocks,
+            )
             if drawn.cone.all():
                 model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
             elif drawn.cone.any():

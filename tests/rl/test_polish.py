@@ -16,6 +16,10 @@ from rl.policy import Policy, PolicyError, load_policy
 from rl.polish import Aim, Crowd, Search, aims, polish, worth
 from rl.polish_config import Polish
 from rl.runlog import read_progress
+from rl.trials import Share
+from sports.env import Env
+from sports.humanoid.body import load_body
+from sports.physics.variation import Variation
 
 D, H, U = 6, 5, 3
 
@@ -71,6 +75,8 @@ def test_a_shift_moves_one_action_by_its_unit():
     first, second = (played(policy, Directions(weights_of(policy), changes).at(e), obs) - base
                      for e in torch.eye(len(changes))[1:3])  # fmt: skip
     assert float((first[:, 0] * second[:, 0]).mean()) == pytest.approx(0.0, abs=1e-7)
+    one = shifts(policy, found, unit, [1, 2])[0]["head.bias"]
+    torch.testing.assert_close(one, torch.tensor([0.0, unit, 0.0]))
     with pytest.raises(ValueError, match="ways"):
         phases(policy, obs[:1].repeat(9, 1), 1)
 
@@ -166,6 +172,9 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path):
         ({"candidates": 2}, "at least 4"),
         ({"share": 0.0}, "positive"),
         ({"start_noise": -0.1}, "noise"),
+        ({"variation": Variation(uneven=0.1)}, "--vary as well"),
+        ({"vary": True, "engine": "drake"}, "in drake no worlds vary"),
+        ({"joints": ("R_*",), "components": -1, "others": ("zero",)}, "--joints"),
     ):
         with pytest.raises(ValueError, match=said):
             replace(CONFIG, **change)
@@ -173,7 +182,55 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path):
         polish(replace(CONFIG, policy="zero", out=tmp_path))
     with pytest.raises(PolicyError, match="not of 'long_jump'"):
         polish(replace(CONFIG, policy=shipped("high_jump"), out=tmp_path))
+    with pytest.raises(ValueError, match="no joint is called 'Tail_x'; there are L_Hip_x"):
+        polish(replace(CONFIG, joints=("R_Hip_*", "Tail_x"), out=tmp_path))
+    with pytest.raises(ValueError, match="in latents"):
+        through = {"name": "hurdling", "policy": "pretrained:latent", "objective": "success=1"}
+        polish(replace(CONFIG, joints=("R_*",), out=tmp_path, **through))
     assert not list(tmp_path.iterdir())
+
+
+VARIED = replace(
+    CONFIG,
+    joints=("R_Shoulder_*", "Torso_y"),
+    episodes=3,
+    generations=1,
+    vary=True,
+    timestep_divisor=2,
+    variation=Variation(own_share=0.4, felt_share=0.5),
+)
+
+
+def test_candidates_meet_the_same_starts_in_the_same_worlds(monkeypatch: pytest.MonkeyPatch):
+    class Seen(Exception):
+        pass
+
+    def look(policy: Policy, share: Share, env: Env) -> torch.Tensor:
+        shown = [env.reset()]
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(12):  # as long as nobody falls
+            action = 0.3 * torch.randn(1, 3, 1, env.action_size, generator=generator)
+            shown.append(env.step(action.expand(5, -1, -1, -1).flatten(0, 1)).obs)
+        for obs in shown:
+            blocks = obs.view(5, 3, -1)
+            assert torch.equal(blocks, blocks[:1].expand(5, -1, -1))
+        first, last = shown[0][:3, 0], shown[-1][:3, 0]
+        assert (first[1:] - first[0]).abs().amax(1).min() > 1e-3  # one's starts differ
+        assert (last[1:] - last[0]).abs().amax(1).min() > 0.1
+        raise Seen
+
+    monkeypatch.setattr("rl.polish.watched", look)
+    with pytest.raises(Seen):
+        polish(VARIED, quiet=True)
+
+
+def test_joints_that_are_not_named_keep_their_actions(tmp_path: Path):
+    polish(replace(VARIED, out=tmp_path, shift=0.05), quiet=True)
+    own = weights_of(load_policy("pretrained", "long_jump"))["head.bias"]
+    new = weights_of(load_policy(tmp_path / "policy.safetensors", "long_jump"))["head.bias"]
+    names = [dof.name for dof in load_body("smpl").dofs]
+    moved = {name for name, x in zip(names, (new - own).abs(), strict=True) if x > 2e-3}
+    assert moved and moved <= {"R_Shoulder_x", "R_Shoulder_y", "R_Shoulder_z", "Torso_y"}
 
 
 def shipped(task: str) -> str:

@@ -1,0 +1,54 @@
+"""What a command says of the worlds to play in, as the engine's options. Light to import."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, Protocol
+
+from sports.physics.variation import Variation
+
+
+class Worlds(Protocol):
+    """Settings that several commands have."""
+
+    @property
+    def timestep_divisor(self) -> int:
+        """2 halves the physics time step at the same control rate."""
+        ...
+
+    @property
+    def felt_damping(self) -> bool:
+        """Contacts feel the joints' damping."""
+        ...
+
+    @property
+    def vary(self) -> bool:
+        """The worlds differ."""
+        ...
+
+    @property
+    def variation(self) -> Variation:
+        """How."""
+        ...
+
+
+def mistakes(worlds: Worlds) -> Iterator[str]:
+    """What cannot be, as sentences."""
+    if worlds.timestep_divisor < 1:
+        yield f"timestep-divisor must be at least 1, not {worlds.timestep_divisor}"
+    if worlds.variation != Variation() and not worlds.vary:
+        yield "the --variation options are of worlds that vary: give --vary as well"
+    if worlds.variation.own_stride != 1:
+        yield "own-stride is the timestep-divisor: leave --variation.own-stride out"
+    if worlds.variation.own_share and worlds.felt_damping:
+        yield "own worlds do not feel damping: leave --variation.own-share or --felt-damping out"
+
+
+def engine_options(worlds: Worlds, seed: int) -> dict[str, Any]:
+    """The engine's options for such worlds, drawn with a seed."""
+    options: dict[str, Any] = {"felt_damping": True} if worlds.felt_damping else {}
+    if worlds.vary:
+        variation = replace(worlds.variation, own_stride=worlds.timestep_divisor)
+        options |= {"variation": variation, "variation_seed": seed}
+    return options
