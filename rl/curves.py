@@ -21,6 +21,7 @@ POINTS = 60
 DIGITS = 6
 """Of every number that is not whole: more are noise, and most of the file."""
 KEPT = ("samples", "minutes", "return", "episode_steps", "samples_per_s", "nan_worlds", "overflow")
+KEPT += ("middle", "candidates")
 ORIGIN = ("task", "algo", "strength", "limits", "commit", "hardware", "versions", "config")
 
 
@@ -34,7 +35,8 @@ def record_curve(
         card: of the policy it ended with; its origin is copied.
         out: JSON file, written atomically, on one line: the origin, and ``rows``, a list of numbers
             (null where there was none) for each column: samples, minutes, mean return and length of
-            episodes, speed, broken worlds, and every metric and curriculum.
+            episodes, speed, broken worlds, and every metric and curriculum; of a policy that was
+            polished what ``olympics-opt polish`` wrote, with the origin of that search.
         points: rows to keep, evenly spread.
 
     Raises ValueError for a file without rows or columns of a curve.
@@ -48,6 +50,9 @@ def record_curve(
     names = [k for k in rows[0] if k in KEPT or k.startswith(("metrics/", "curriculum/"))]
     columns = {name: [_number(rows[i][name]) for i in picked] for name in names}
     origin = {name: card[name] for name in ORIGIN if name in card}
+    if "middle" in rows[0] and "polish" in card:
+        search = dict(card["polish"])
+        origin |= {name: search.pop(name) for name in ("commit", "hardware")} | {"config": search}
     curve = {"format": "olympics-opt curve 1", **origin, "rows": columns}
     return write_json(out, curve, indent=None)
 
@@ -67,7 +72,9 @@ def main(args: Sequence[str]) -> int:
         if len(args) != 2:
             raise ValueError("give a run's folder or a policy file, and the JSON file to write")
         source, out = Path(args[0]), Path(args[1])
-        if source.is_dir():
+        if (source / "search.npz").exists():  # of olympics-opt polish
+            policy, progress = source / "policy.safetensors", source / "progress.csv"
+        elif source.is_dir():
             policy = export_policy(source, source / "policy.safetensors")
             progress = source / "progress.csv"
         else:

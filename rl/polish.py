@@ -47,6 +47,7 @@ from rl.trials import Share, opened, play_episodes
 from rl.worlds import engine_options
 from sports.env import Env
 from sports.humanoid.body import load_body
+from sports.physics.variation import Variation
 from sports.registry import get_task
 from warmstart.evolution import strategy
 from warmstart.npz import read_npz, write_npz
@@ -214,7 +215,7 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
                 now = time.monotonic()
                 spent.minutes, began = spent.minutes + (now - began) / 60.0, now
                 spent.samples += int(trials["episode_steps"].sum())
-                _save(config, policy, directions, search, found, spent)
+                _save(config, options, policy, directions, search, found, spent)
                 rows.append(
                     {
                         "iteration": search.generation,
@@ -325,8 +326,18 @@ def _about(config: Polish, policy: Policy) -> dict[str, Any]:
     return json.loads(json.dumps(said | {"of": policy.metadata["sha256"]}))
 
 
+def _worlds(config: Polish, options: dict[str, Any] | None) -> dict[str, Any]:
+    """What the episodes were played in, where it is not the task's own."""
+    names = ("engine", "start_noise", "timestep_divisor", "felt_damping", "vary")
+    told = {name: getattr(config, name) for name in names} | {"task": options or {}}
+    given, usual = vars(config.variation), vars(Variation())
+    told["variation"] = {name: x for name, x in given.items() if x != usual[name]}
+    return {name: x for name, x in told.items() if x}
+
+
 def _save(
     config: Polish,
+    options: dict[str, Any] | None,
     policy: Policy,
     directions: Directions,
     search: Search,
@@ -336,7 +347,12 @@ def _save(
     """Writes the middle as a policy, then the search."""
     middle = directions.at(torch.from_numpy(search.middle))
     episodes = search.generation * config.blocks * config.episodes
-    told = {"episodes": episodes, "commit": provenance.commit(), "hardware": provenance.hardware()}
+    told = {
+        "episodes": episodes,
+        "worlds": _worlds(config, options),
+        "commit": provenance.commit(),
+        "hardware": provenance.hardware(),
+    }
     card = {
         **policy.metadata,
         "precision": "float16",

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from rl import curves
 from rl.directions import Directions, phases, scaled, shifts, towards, weights_of
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError, load_policy
@@ -151,6 +152,13 @@ def test_a_search_that_was_stopped_goes_on_and_its_middle_is_what_was_written(tm
     assert 0.0 < float(moved.max()) < 0.1
     same = weights_of(own)["trunk.0.weight"]
     torch.testing.assert_close(weights_of(written)["trunk.0.weight"], same, atol=1e-4, rtol=2e-3)
+
+    assert written.metadata["polish"]["worlds"] == {"engine": "mujoco", "start_noise": 0.02}
+    assert curves.main([str(tmp_path / "whole"), str(tmp_path / "curve.json")]) == 0
+    curve = json.loads((tmp_path / "curve.json").read_text())
+    assert curve["rows"]["middle"] == pytest.approx([row["middle"] for row in told], rel=1e-5)
+    assert curve["commit"] == written.metadata["polish"]["commit"]
+    assert curve["config"]["of"] == own.metadata["sha256"]
 
     parts = replace(CONFIG, out=tmp_path / "parts")
     polish(replace(parts, generations=1), quiet=True)

@@ -657,3 +657,35 @@ def test_the_rest_of_a_flight_is_that_of_turning_tops():
     assert {row[2] for row in rows} == {False, True} and max(rows)[0] > 15.0
     with pytest.raises(ValueError, match="share"):
         Throw(release_ends=1.5)
+
+
+def test_a_foretold_turn_to_the_left_is_one_of_the_javelin():
+    """One that turns so, and one that is told to: the same flight. And each world has its own."""
+    world = Throw()
+    nose = torch.tensor([[math.cos(0.6), 0.0, math.sin(0.6)]])
+    told = []
+    for own, more in ((1.3, 0.0), (-0.2, 1.5), (-0.2, 0.0)):
+        world.javelin((0.0, 0.0, 2.0), elevation=0.6, velocity=(17.0, 0.0, 11.0))
+        quat = world.state.qpos[0, world.q][3:]
+        spin = quaternion.rotate(quaternion.conjugate(quat), torch.tensor([0.0, 0.0, own]))
+        world.state.qvel[:, world.v][:, 3:] = spin
+        world._apply()
+        told.append(rest_of_flight(world.env.view, nose, 1 / 30, torch.tensor([more])))
+    for a, b in zip(told[0], told[1], strict=True):
+        torch.testing.assert_close(a, b)
+    assert float(told[2].x[0]) > float(told[0].x[0]) + 2.0  # who turns aside has more drag
+    clip = Clip.load(SHIPPED)
+    options = {"release_ends": 1.0, "release_turn": (-1.5, 1.5)}
+    env = make_env("javelin", num_worlds=6, training=False, options=options)
+    actions = reference(clip, env)
+    env.reset()
+    for step in range(40):
+        result = env.step(actions[min(step, len(actions) - 1)].expand(6, 1, -1))
+        if result.terminated.any():
+            break
+    assert result.terminated.all()
+    far = result.metrics["distance"]
+    assert len(set(far.round(decimals=2).tolist())) == 6 and float(far.max() - far.min()) > 2.0
+    env.close()
+    with pytest.raises(ValueError, match="release_ends"):
+        make_env("javelin", num_worlds=1, options={"release_turn": (-1.0, 0.0)})
