@@ -153,7 +153,8 @@ def test_a_search_that_was_stopped_goes_on_and_its_middle_is_what_was_written(tm
     same = weights_of(own)["trunk.0.weight"]
     torch.testing.assert_close(weights_of(written)["trunk.0.weight"], same, atol=1e-4, rtol=2e-3)
 
-    assert written.metadata["polish"]["worlds"] == {"engine": "mujoco", "start_noise": 0.02}
+    played_in = {"engine": "mujoco", "start_noise": 0.02, "timestep_divisor": 1}
+    assert written.metadata["polish"]["worlds"] == played_in
     assert curves.main([str(tmp_path / "whole"), str(tmp_path / "curve.json")]) == 0
     curve = json.loads((tmp_path / "curve.json").read_text())
     assert curve["rows"]["middle"] == pytest.approx([row["middle"] for row in told], rel=1e-5)
