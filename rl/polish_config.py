@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from rl.worlds import mistakes as world_mistakes
-from sports.physics.variation import Variation
+from sports.variation import Variation
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, Protocol
 
-from sports.physics.variation import Variation
+from sports.variation import Variation
 
 
 class Worlds(Protocol):

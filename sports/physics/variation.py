@@ -23,73 +23,10 @@ import numpy as np
 from sports.humanoid.body import Body
 from sports.humanoid.mjcf import holds, is_bounce, yields
 from sports.scene import Scene
+from sports.variation import FELT, RANGES, Variation
 
-_RANGES = ("friction", "stiffness", "damping", "contact_time", "contact_damping")
-_RANGES += ("contact_impedance",)
-_FELT = ("contact_time", "contact_damping", "contact_impedance")
 LEAST_SUBSTEPS = 4
 """In a control step, of the coarsest worlds: the usual number."""
-
-
-@dataclass(frozen=True)
-class Variation:
-    """Ranges drawn once per world, uniformly."""
-
-    friction: tuple[float, float] = (0.6, 1.6)
-    """Factor of every friction coefficient."""
-    stiffness: tuple[float, float] = (0.9, 1.1)
-    """Factor of every servo stiffness."""
-    damping: tuple[float, float] = (0.9, 1.1)
-    """Factor of every joint damping."""
-    uneven: float = 0.0
-    """Stiffness and damping of the joints of one side are greater by up to this share, those of the
-    other side smaller by as much; 0 for two sides alike. Who runs in such worlds must steer: a
-    policy that learned where both sides are alike runs straight by itself, in other engines to one
-    side (docs/physics.md)."""
-    contact_time: tuple[float, float] = (0.006, 0.025)
-    """Time constant of the contacts of athletes and ground (s). MuJoCo does not go below two time
-    steps."""
-    contact_damping: tuple[float, float] = (0.5, 1.5)
-    """Damping ratio of the same contacts."""
-    contact_impedance: tuple[float, float] = (0.4, 0.8)
-    """Their impedance: the less, the more they yield to load."""
-    coarse_share: float = 0.5
-    """Share of worlds that take several substeps in one: 2, 4, ... as often as leaves them
-    ``LEAST_SUBSTEPS``. With ``timestep_divisor=4`` these run at the usual time step or at half of
-    it, and the others at a quarter."""
-    felt_share: float = 0.5
-    """Share of worlds whose contacts feel the joints' damping, as Drake's do. The ground that they
-    need is firmer; its ranges are:"""
-    felt_contact_time: tuple[float, float] = (0.01, 0.03)
-    felt_contact_damping: tuple[float, float] = (0.7, 1.3)
-    felt_contact_impedance: tuple[float, float] = (0.85, 0.98)
-    hold_time: tuple[float, float] = (0.002, 0.0125)
-    """Time constant of the contacts of athletes with what they can hold (s). Under the 100 N of a
-    finger that throws a ball sinks in by 8 mm at the model's 1/120 s, by less at 2 ms and in
-    Drake."""
-    cone_share: float = 0.0
-    """Share of worlds in which friction has a round cone, as in Drake, instead of a pyramid inside
-    it, which gives less where a foot slips across its axes. On a GPU all worlds or none."""
-    own_share: float = 0.0
-    """Share of worlds that are the task's own, in which nothing is drawn and contacts do not feel
-    the damping: for a policy that must also hold there."""
-    own_stride: int = 1
-    """Substeps that those take in one: the ``timestep_divisor``, so that theirs is the task's own
-    time step."""
-
-    def __post_init__(self) -> None:
-        for name in (*_RANGES, *(f"felt_{name}" for name in _FELT), "hold_time"):
-            low, high = getattr(self, name)
-            if not 0.0 < low <= high:
-                raise ValueError(f"variation: {name} must be 0 < low <= high, not {low}, {high}")
-        for name in ("coarse_share", "felt_share", "cone_share", "own_share"):
-            share = getattr(self, name)
-            if not 0.0 <= share <= 1.0:
-                raise ValueError(f"variation: {name} must be in [0, 1], not {share}")
-        if not 0.0 <= self.uneven < 1.0:
-            raise ValueError(f"variation: uneven must be in [0, 1), not {self.uneven}")
-        if self.own_stride < 1:
-            raise ValueError(f"variation: own_stride must be at least 1, not {self.own_stride}")
 
 
 @dataclass(frozen=True)
@@ -158,12 +95,12 @@ def draw(
     def uniform(span: tuple[float, float]) -> np.ndarray:
         return rng.uniform(*span, size=num_worlds)
 
-    values = {name: uniform(getattr(variation, name)) for name in _RANGES}
+    values = {name: uniform(getattr(variation, name)) for name in RANGES}
     coarse = rng.random(num_worlds) < variation.coarse_share
     strides = [s for s in (2, 4, 8) if substeps % s == 0 and substeps // s >= LEAST_SUBSTEPS]
     drawn = np.array(strides or [1])[rng.integers(len(strides or [1]), size=num_worlds)]
     felt = (rng.random(num_worlds) < variation.felt_share) | all_felt
-    for name in _FELT:
+    for name in FELT:
         own = uniform(getattr(variation, f"felt_{name}"))
         values[name] = np.where(felt, own, values[name])
     values["hold_time"] = uniform(variation.hold_time)
