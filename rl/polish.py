@@ -265,10 +265,12 @@ def _actions(config: Polish, policy: Policy) -> list[int]:
         raise ValueError("a policy in latents does not move single joints: leave --joints out")
     body = load_body(get_task(config.name).body)
     names = [dof.name for dof in body.dofs]
+    chosen: set[str] = set()
     for pattern in config.joints:
-        if not fnmatch.filter(names, pattern):
+        found = fnmatch.filter(names, pattern)
+        if not found:
             raise ValueError(f"no joint is called '{pattern}'; there are {', '.join(names)}")
-    chosen = {name for pattern in config.joints for name in fnmatch.filter(names, pattern)}
+        chosen.update(found)
     return [i for i, name in enumerate(names) if name in chosen]
 
 

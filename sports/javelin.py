@@ -121,7 +121,7 @@ class Javelin:
             )
         if not 0.0 <= self.release_ends <= 1.0:
             raise ValueError(f"a share of the worlds is in [0, 1], not {self.release_ends}")
-        if self.release_turn != (0.0, 0.0) and self.release_ends == 0.0:
+        if any(self.release_turn) and self.release_ends == 0.0:
             raise ValueError("release_turn is of a flight that is foretold: give release_ends")
         if self.let_go < 0.0:
             raise ValueError(f"the reward for letting go must not be negative: {self.let_go}")
@@ -244,7 +244,7 @@ def advance(view: View, memory: Memory) -> Advance:
         number = torch.arange(len(x), device=x.device)
         over = (number < view.config.release_ends * len(x)) & free & ~memory["released"] & ~failed
         low, high = view.config.release_turn
-        left = low + (high - low) * ((number * GOLDEN) % 1.0)
+        left = low + (high - low) * ((number * GOLDEN) % 1.0) if low or high else None
         come = flight(view, nose, view.control_timestep, left)
         mark, aside = torch.where(over, come.x, mark), torch.where(over, come.y, aside)
         nose_first = torch.where(over, come.nose_first, nose_first)

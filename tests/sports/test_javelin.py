@@ -689,3 +689,5 @@ def test_a_foretold_turn_to_the_left_is_one_of_the_javelin():
     env.close()
     with pytest.raises(ValueError, match="release_ends"):
         make_env("javelin", num_worlds=1, options={"release_turn": (-1.0, 0.0)})
+    # A run that goes on has read its options from JSON, where a pair is a list.
+    make_env("javelin", num_worlds=1, options={"release_turn": [0.0, 0.0]}).close()
