@@ -373,6 +373,25 @@ def test_boards_may_stand_higher_in_training_than_they_look():
         Hurdling(taller=0.1, toppling=True)
 
 
+def test_unseen_height_is_there_in_races_too():
+    """The same more for every board that stands, in training and evaluation, and nothing else."""
+    for training in (True, False):
+        plain, env = (
+            make_env("hurdling", num_worlds=64, seed=5, training=training, options=options)
+            for options in ({"height": 0.9}, {"height": 0.9, "unseen": 0.06})
+        )
+        assert torch.equal(env.memory["marks"], plain.memory["marks"])
+        assert torch.equal(env.reset(), plain.reset())
+        tops, were = env.physics.mocap_pos[:, :, 2], plain.physics.mocap_pos[:, :, 2]
+        up = were > 0.0
+        assert torch.allclose(tops, were + 0.06 * up) and up.any()
+    for wrong, why in (({"unseen": -0.1}, "not lower"), ({"unseen": 0.2}, "off the ground")):
+        with pytest.raises(ValueError, match=why):
+            Hurdling(**wrong)
+    with pytest.raises(ValueError, match="topples"):
+        Hurdling(unseen=0.1, toppling=True)
+
+
 def test_the_share_of_whole_races_is_that_of_the_option():
     """Whole races start at the line, before the first hurdle; a tenth of the others do too."""
     for share in (0.1, 0.6, 1.0):
