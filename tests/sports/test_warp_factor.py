@@ -6,6 +6,7 @@ from contextlib import nullcontext
 from types import SimpleNamespace
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import pytest
 import torch
@@ -124,3 +125,50 @@ def test_a_step_is_the_same_with_the_library_s_own_pieces(task: str, monkeypatch
             physics.close()
     assert (ends[0] - ends[1]).abs().max() < 2e-4
     assert (ends[0] - ends[0][:1]).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_racket_deep_in_a_box_does_not_overflow(device: str):
+    """Where the library alone runs out of room; a depth that is found is C MuJoCo's."""
+    spec = """<mujoco><worldbody>
+      <body><freejoint/><geom type="cylinder" size="0.075 0.01"/></body>
+      <body><freejoint/><geom type="box" size="0.06 0.1 0.04"/></body>
+    </worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(spec)
+    data = mujoco.MjData(model)
+    drawn, count = np.random.default_rng(0), 100_000
+    poses = np.zeros((count, 14), dtype=np.float32)
+    poses[:, 7:10] = drawn.uniform(-0.2, 0.2, (count, 3)) * drawn.uniform(0, 1, (count, 1))
+    for first in (3, 10):
+        turn = drawn.normal(size=(count, 4))
+        poses[:, first : first + 4] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+    # Found by playing all of them.
+    poses = poses[
+        [16270, 16299, 17001, 24139, 25996, 26605, 32326, 35204, 56385, 76651, 82170, 95626]
+    ]
+    missed, depths = [], []
+    with wp.ScopedDevice(device):
+        m = mjw.put_model(model)
+        m.opt.warn_overflow = 0
+        for room in (nullcontext(), faster(pieces(model))):
+            d = mjw.put_data(model, data, nworld=len(poses), nconmax=16, njmax=64)
+            wp.copy(d.qpos, wp.array(poses, dtype=float))
+            with room:
+                mjw.kinematics(m, d)
+                mjw.collision(m, d)
+            missed.append((d.overflow.numpy() != 0).sum())
+            count = d.nacon.numpy()[0]
+            depths = np.zeros(len(poses))
+            worlds = d.contact.worldid.numpy()[:count]
+            np.minimum.at(depths, worlds, d.contact.dist.numpy()[:count])
+    assert missed[1] == 0 < missed[0]
+    found = 0
+    for pose, depth in zip(poses, depths, strict=True):
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        if depth < 0.0:
+            found += 1
+            assert abs(data.contact.dist.min() - depth) < 1e-3 and depth < -0.01
+    assert found >= 2
