@@ -75,8 +75,7 @@ def moved(change: Mapping[str, Tensor], device: torch.device | str) -> Weights:
 
 @dataclass(frozen=True)
 class Phases:
-    """What the last hidden layer of a policy at play does: its mean and its strongest principal
-    components, which follow the phases of the motion."""
+    """What the last hidden layer of a policy at play does: it follows the phases of the motion."""
 
     middle: Tensor
     """(H,)"""
@@ -85,12 +84,9 @@ class Phases:
 
 
 def phases(policy: Policy, obs: Tensor, components: int) -> Phases:
-    """Those of the observations (M, D). Raises ValueError where the layer has fewer of them."""
-    assert policy.actor is not None
-    with torch.no_grad():
-        clip = policy.metadata["observation_clip"]
-        seen = ((torch.nan_to_num(obs) - policy.mean) / policy.std).clamp(-clip, clip)
-        hidden = policy.actor.trunk(seen).double()  # (M, H)
+    """The mean and the strongest principal components in the observations (M, D). Raises ValueError
+    where the layer has fewer of them."""
+    hidden = _hidden(policy, obs)
     middle = hidden.mean(0)
     _, spread, axes = torch.linalg.svd(hidden - middle, full_matrices=False)
     if components > int((spread > 1e-6 * hidden.norm()).sum()):
@@ -100,18 +96,64 @@ def phases(policy: Policy, obs: Tensor, components: int) -> Phases:
     return Phases(middle.float(), (axes[:components] * scale).float())
 
 
+RIDGE = 0.01
+"""Of a part's phases: what is added to each variance of the rest, in shares of their mean."""
+
+
+def phases_of_part(policy: Policy, obs: Tensor, part: Tensor, components: int) -> Phases:
+    """Where the observations (M, D) of a part (M,) differ most from the rest: the mean of the rest,
+    and the axes of the greatest quotients of the mean squares about it, within the part and in the
+    rest. Along different axes the layer moves independently in both.
+
+    Raises ValueError for a part without observations, or with all of them, and for more components
+    than the layer has units.
+    """
+    hidden = _hidden(policy, obs)
+    if not bool(part.any()) or bool(part.all()):
+        raise ValueError("a part of the episodes needs something in it and something beside it")
+    if components > hidden.shape[1]:
+        raise ValueError(f"the last hidden layer does not vary in {components} ways")
+    middle = hidden[~part].mean(0)
+    within, rest = hidden[part] - middle, hidden[~part] - middle
+    inside, outside = within.T @ within / len(within), rest.T @ rest / len(rest)
+    outside.diagonal().add_(RIDGE * outside.diagonal().mean())
+    # inside a = q outside a: with outside = L L^T, an ordinary problem in L^T a.
+    lower = torch.linalg.cholesky(outside)
+    half = torch.linalg.solve_triangular(lower, inside, upper=False)
+    whitened = torch.linalg.solve_triangular(lower, half.T, upper=False)
+    _, vectors = torch.linalg.eigh((whitened + whitened.T) / 2)
+    best = vectors.flip(1)[:, :components]
+    axes = torch.linalg.solve_triangular(lower.T, best, upper=True).T
+    size = (within @ axes.T).square().mean(0).sqrt()
+    return Phases(middle.float(), (axes / size[:, None]).float())
+
+
+def _hidden(policy: Policy, obs: Tensor) -> Tensor:
+    """(M, H) the last hidden layer at observations (M, D)."""
+    assert policy.actor is not None
+    with torch.no_grad():
+        clip = policy.metadata["observation_clip"]
+        seen = ((torch.nan_to_num(obs) - policy.mean) / policy.std).clamp(-clip, clip)
+        return policy.actor.trunk(seen).double()
+
+
 def shifts(
-    policy: Policy, found: Phases, unit: float, actions: Sequence[int] | None = None
+    policy: Policy,
+    found: Phases,
+    unit: float,
+    actions: Sequence[int] | None = None,
+    always: bool = True,
 ) -> list[Weights]:
     """U (1 + P) changes of the last layer that move one action each, of all or of these: by
     ``unit`` always, or by ``unit`` times a component: more of it in one phase of the motion and
-    less in another."""
+    less in another. Without ``always`` the U P latter."""
     assert policy.actor is not None
     changes: list[Weights] = []
     for action in range(policy.actor.head.out_features) if actions is None else actions:
         one = torch.zeros_like(policy.actor.head.bias)
         one[action] = unit
-        changes.append({"head.bias": one})
+        if always:
+            changes.append({"head.bias": one})
         changes += [
             {"head.weight": torch.outer(one, axis), "head.bias": -one * (axis @ found.middle)}
             for axis in found.axes

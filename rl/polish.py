@@ -34,6 +34,7 @@ from rl.directions import (
     Weights,
     moved,
     phases,
+    phases_of_part,
     scaled,
     shifts,
     towards,
@@ -193,10 +194,11 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
     share = _share(config, policy, options)
     rows: list[Row] = []
     with opened(policy, share) as env:
-        search, found, spent = _begin(config, policy, lambda: watched(policy, share, env))
+        search, found, spent = _begin(config, policy, lambda: _seek(config, policy, share, env))
         changes = [moved(scaled(way, config.share), env.device) for way in ways]
         if found is not None:
-            changes += shifts(policy, found, config.shift, _actions(config, policy))
+            actions = _actions(config, policy)
+            changes += shifts(policy, found, config.shift, actions, config.part is None)
         directions, crowd = Directions(weights_of(policy), changes), Crowd(policy, config.blocks)
 
         def judge(numbers: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -279,25 +281,37 @@ def _mean(values: np.ndarray) -> float | None:
     return None if np.isnan(values).all() else float(np.nanmean(values))
 
 
-def watched(policy: Policy, share: Share, env: Env) -> Tensor:
-    """(M, D) observations of the policy at play, from all phases of its episodes."""
-    seen: list[Tensor] = []
+def watched(policy: Policy, share: Share, env: Env) -> tuple[Tensor, Tensor]:
+    """(M, D) observations of the policy at play, from all phases of its episodes, and (M,) how much
+    of the longest episode had gone by."""
+    seen: list[tuple[Tensor, Tensor]] = []
     steps = 0
 
     def probe(obs: Tensor) -> Tensor:
         nonlocal steps
         if steps % WATCHED_EVERY == 0:
-            seen.append(obs.flatten(0, -2).clone())
+            gone = env.view.clock / env.max_steps
+            seen.append((obs.flatten(0, -2).clone(), gone.repeat_interleave(obs.shape[1])))
         steps += 1
         return policy(obs)
 
     play_episodes(probe, share, env)
-    rows = torch.cat(seen)
-    return rows[:: max(1, len(rows) // WATCHED_ROWS)]
+    rows, gone = (torch.cat(x) for x in zip(*seen, strict=True))
+    every = max(1, len(rows) // WATCHED_ROWS)
+    return rows[::every], gone[::every]
+
+
+def _seek(config: Polish, policy: Policy, share: Share, env: Env) -> Phases:
+    """The phases to shift in."""
+    obs, gone = watched(policy, share, env)
+    if config.part is None:
+        return phases(policy, obs, config.components)
+    begin, end = config.part
+    return phases_of_part(policy, obs, (gone >= begin) & (gone <= end), config.components)
 
 
 def _begin(
-    config: Polish, policy: Policy, watch: Callable[[], Tensor]
+    config: Polish, policy: Policy, seek: Callable[[], Phases]
 ) -> tuple[Search, Phases | None, Spent]:
     """A new search with the phases that it shifts actions in, or what ``out`` holds of one. Raises
     ValueError for another one's."""
@@ -315,8 +329,9 @@ def _begin(
         middle, spreads, generation = arrays["middle"], arrays["spreads"], int(meta["generation"])
         spent = Spent(float(meta["minutes"]), int(meta["samples"]))
     else:
-        found = None if config.components < 0 else phases(policy, watch(), config.components)
-        size = len(config.others) + len(_actions(config, policy)) * (1 + config.components)
+        found = None if config.components < 0 else seek()
+        each = config.components + (config.part is None)
+        size = len(config.others) + len(_actions(config, policy)) * each
         middle, spreads, generation, spent = np.zeros(size), np.ones(size), 0, Spent()
     return Search(middle, spreads, config.candidates, config.seed, generation), found, spent
 
@@ -325,6 +340,8 @@ def _about(config: Polish, policy: Policy) -> dict[str, Any]:
     """What a search that goes on must have been about."""
     names = ("others", "components", "joints", "objective", "shift", "share")
     said = {name: getattr(config, name) for name in names}
+    if config.part is not None:
+        said["part"] = config.part
     return json.loads(json.dumps(said | {"of": policy.metadata["sha256"]}))
 
 

@@ -36,6 +36,10 @@ class Polish:
     components: int = 4
     """Phases of the motion (principal components of the last hidden layer) in step with which
     every action may shift; -1 for no shifts at all."""
+    part: tuple[float, float] | None = None
+    """Shift in this part of the episodes above all (its begin and end, as shares of the longest
+    episode), in step with what tells it from the rest, and nowhere always. A race that is lost at
+    its last hurdles is better left alone before."""
     joints: tuple[str, ...] = ()
     """Shift these alone, by name (``R_Shoulder_*``, ``Torso_?``); by default every action. What a
     throw needs is in the trunk and one arm, not in 153 joints."""
@@ -78,6 +82,11 @@ class Polish:
             raise ValueError("a search needs at least 4 candidates with 1 episode each")
         if self.components < -1 or (self.components < 0 and not self.others):
             raise ValueError("nothing to search: give components >= 0 or other policies")
+        if self.part is not None:
+            if not 0.0 <= self.part[0] < self.part[1] <= 1.0:
+                raise ValueError(f"a part of the episodes is two shares of it, not {self.part}")
+            if self.components < 1:
+                raise ValueError("a part of the episodes needs --components of 1 or more")
         if not 0.0 <= self.start_noise < 1.0:
             raise ValueError(f"the starts' noise must lie in [0, 1) rad, not {self.start_noise}")
         if self.shift <= 0.0 or self.share <= 0.0:

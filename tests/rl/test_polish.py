@@ -11,7 +11,15 @@ import pytest
 import torch
 
 from rl import curves
-from rl.directions import Directions, phases, scaled, shifts, towards, weights_of
+from rl.directions import (
+    Directions,
+    phases,
+    phases_of_part,
+    scaled,
+    shifts,
+    towards,
+    weights_of,
+)
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError, load_policy
 from rl.polish import Aim, Crowd, Search, aims, polish, worth
@@ -80,6 +88,46 @@ def test_a_shift_moves_one_action_by_its_unit():
     torch.testing.assert_close(one, torch.tensor([0.0, unit, 0.0]))
     with pytest.raises(ValueError, match="ways"):
         phases(policy, obs[:1].repeat(9, 1), 1)
+
+
+def test_what_is_shifted_in_a_part_is_what_stands_out_there():
+    policy, unit = made(0), 0.01
+    obs = torch.randn(6000, D)
+    part = torch.arange(len(obs)) % 3 == 0
+    obs[part] += torch.randn(D)
+    found = phases_of_part(policy, obs, part, 2)
+    changes = shifts(policy, found, unit, always=False)
+    assert len(changes) == U * 2
+    base, size = policy(obs), []
+    for k, one in enumerate(torch.eye(len(changes))):
+        moved = played(policy, Directions(weights_of(policy), changes).at(one), obs) - base
+        action = k // 2
+        within, rest = (float(moved[w, action].square().mean().sqrt()) for w in (part, ~part))
+        assert within == pytest.approx(unit, rel=1e-3)
+        size.append(rest / within)
+        assert moved[:, [u for u in range(U) if u != action]].abs().max() == 0.0
+    assert size[0] < size[1]
+    hidden = policy.actor.trunk((obs - policy.mean) / policy.std) - found.middle  # type: ignore[union-attr]
+    for axis in torch.randn(200, H):  # none of these keeps more out of the rest
+        value = hidden @ axis
+        assert value[~part].norm() / value[part].norm() * 2**-0.5 > size[0] - 0.01
+    for wrong in (part & False, part | True):
+        with pytest.raises(ValueError, match="beside it"):
+            phases_of_part(policy, obs, wrong, 1)
+    with pytest.raises(ValueError, match=f"{H + 1} ways"):
+        phases_of_part(policy, obs, part, H + 1)
+
+
+def test_a_part_is_told_by_the_clock_of_each_episode(tmp_path: Path):
+    config = replace(CONFIG, part=(0.0, 0.1), out=tmp_path, generations=1)
+    polish(config, quiet=True)
+    card = load_policy(tmp_path / "policy.safetensors", "long_jump").metadata
+    assert card["polish"]["part"] == [0.0, 0.1]
+    with pytest.raises(ValueError, match="another search"):
+        polish(replace(config, part=(0.0, 0.2), generations=2))
+    # An episode of a long jump is over long before its last tenth.
+    with pytest.raises(ValueError, match="something in it"):
+        polish(replace(config, part=(0.99, 1.0), out=tmp_path / "late"), quiet=True)
 
 
 def test_everyone_in_a_crowd_plays_in_its_own_block():
@@ -181,6 +229,8 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path):
         ({"candidates": 2}, "at least 4"),
         ({"share": 0.0}, "positive"),
         ({"start_noise": -0.1}, "noise"),
+        ({"part": (0.8, 0.2)}, "two shares"),
+        ({"part": (0.8, 0.9), "components": 0}, "--components of 1"),
         ({"variation": Variation(uneven=0.1)}, "--vary as well"),
         ({"vary": True, "engine": "drake"}, "in drake no worlds vary"),
         ({"joints": ("R_*",), "components": -1, "others": ("zero",)}, "--joints"),
