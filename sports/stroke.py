@@ -22,6 +22,8 @@ BODY_DISTANCE = 0.15
 """A ball nearer than this (m) to a link has met the body."""
 LONGEST = 3.0
 """Flights of returns are followed for so long (s)."""
+READY_DISTANCE, READY_HEIGHT = 3.0, 0.2
+"""m from where an athlete began and of its root below the start's: scales of being ready."""
 REACHABLE = 4.0
 """A racket further than this (m) from the ball is as good as this far."""
 
@@ -79,14 +81,34 @@ def judge(game: Game, view: View, memory: Memory, sharpness: float) -> Stroke:
     )
 
 
-def shaping(view: View, memory: Memory, stroke: Stroke, sharpness: float) -> dict[str, Tensor]:
-    """Rewards of the options ``reach`` and ``drive``, where they are asked for."""
+def shaping(
+    game: Game, view: View, memory: Memory, stroke: Stroke, sharpness: float
+) -> dict[str, Tensor]:
+    """Rewards of the options ``reach``, ``drive`` and ``recover``, where they are asked for."""
     config, terms = view.config, {}
     if config.reach > 0.0:
         terms["reach"] = config.reach * nearer(memory, stroke, sharpness)
     if config.drive > 0.0:
         terms["drive"] = config.drive * carried(view, memory, stroke)
+    if config.recover > 0.0:
+        sides = constant(SIDES, stroke.near.device)[: stroke.near.shape[1]]
+        waits = (stroke.point.hitter[:, None] == sides) & (memory["strokes"] > 0)
+        terms["recover"] = config.recover * ready(game, view) * waits
     return terms
+
+
+def ready(game: Game, view: View) -> Tensor:
+    """(N, A) 1 for athletes who stand as at the start, less away from there, lower, leaning or
+    turned from the net."""
+    root, rotation = view.root_pos, view.rotation[:, :, 0]
+    sides = constant(SIDES, root.device)[: root.shape[1]]
+    x, y, z = root.unbind(-1)
+    standing = float(view.physics.scene.start_qpos[view.physics.scene.agent_qpos(0)][2])
+    away = ((x - sides * game.player_x).square() + y.square()) / READY_DISTANCE**2
+    sunk = ((standing - z).clamp(min=0.0) / READY_HEIGHT).square()
+    upright = rotation[..., 2, 2].clamp(min=0.0)
+    facing = 0.5 - 0.5 * sides * rotation[..., 0, 0]
+    return (-0.5 * (away + sunk)).exp() * upright * facing
 
 
 def carried(view: View, memory: Memory, stroke: Stroke) -> Tensor:

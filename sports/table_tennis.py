@@ -150,7 +150,7 @@ def advance(view: View, memory: Memory) -> Advance:
         "approach": now.near if view.config.shadow else now.closer,
         "landing": worth * now.promising,
     }
-    terms |= stroke.shaping(view, memory, now, SHARPNESS)
+    terms |= stroke.shaping(rules, view, memory, now, SHARPNESS)
     return stroke.conclude(rules, view, memory, now, terms)
 
 

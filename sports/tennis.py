@@ -168,7 +168,7 @@ def advance(view: View, memory: Memory) -> Advance:
         "landing": (1.0 + (-now.miss).exp()) * now.promising,
         "bounce": now.landed.float(),
     }
-    terms |= stroke.shaping(view, memory, now, SHARPNESS)
+    terms |= stroke.shaping(rules, view, memory, now, SHARPNESS)
     return stroke.conclude(rules, view, memory, now, terms)
 
 

@@ -103,6 +103,33 @@ def test_a_stroke_is_paid_by_how_far_it_will_carry():
     assert "drive" not in stroke(rally()).terms
 
 
+def test_who_has_played_is_paid_for_standing_ready():
+    """1 for the start itself, from the step after a stroke until the next ball is on its way."""
+    world = rally(recover=2.0)
+    q = world.scene.agent_qpos(0).start
+    assert stroke(world).terms["recover"][0, 0] == 0.0
+
+    def paid(*, dx=0.0, dy=0.0, dz=0.0, yaw=math.pi, pitch=0.0) -> float:
+        half, lean = 0.5 * yaw, 0.5 * pitch
+        turned = (math.cos(half) * math.cos(lean), -math.sin(half) * math.sin(lean))
+        turned += (math.cos(half) * math.sin(lean), math.sin(half) * math.cos(lean))
+        root = (13.0 + dx, dy, STANDING + dz, *turned)
+        world.state.qpos[:, q : q + 7] = torch.tensor(root)
+        return float(world.go((9.0, 1.0, 1.4), (-20.0, 0.0, 5.0)).terms["recover"][0, 0])
+
+    assert paid() == pytest.approx(2.0, abs=1e-3) and paid(dz=0.1) == pytest.approx(2.0, abs=1e-3)
+    assert paid(dx=-3.0) == paid(dy=3.0) == pytest.approx(2.0 * math.exp(-0.5), abs=1e-3)
+    assert paid(dz=-0.2) == pytest.approx(2.0 * math.exp(-0.5), abs=5e-3)
+    assert paid(yaw=0.0) == pytest.approx(0.0, abs=1e-5)
+    assert paid(yaw=math.pi / 2) == pytest.approx(1.0, abs=1e-3)
+    tilted = math.cos(0.5) * 0.5 * (1.0 + math.cos(0.5))
+    assert paid(pitch=0.5) == pytest.approx(2.0 * tilted, abs=1e-3)
+    assert rally(recover=2.0).go((11.0, 0.0, 1.0)).terms["recover"][0, 0] == 0.0
+    assert "recover" not in stroke(rally()).terms
+    with pytest.raises(ValueError, match="must not be negative"):
+        make_env("tennis", num_worlds=1, options={"recover": -1.0})
+
+
 @pytest.mark.parametrize("sport", ["tennis", "table_tennis"])
 def test_narrower_launches_are_those_of_the_sport_nearer_to_the_middle(sport):
     rules = {"tennis": tennis.GAME, "table_tennis": table_tennis.GAME}[sport]
