@@ -174,7 +174,7 @@ class Render:
     out: Path | None = None
     """mp4 file for the video; with ``--all`` a png file."""
     sheet: Path | None = None
-    """png file for the sheet, or jpg for one of half the width."""
+    """png file for the sheet, or webp or jpg for one of half the width."""
     renderer: Literal["gl", "software"] = "gl"
     """``gl`` is MuJoCo's renderer; ``software`` needs no library and is slower."""
     engine: Literal["mujoco", "warp", "drake"] = "mujoco"
@@ -324,7 +324,7 @@ class Match:
     out: Path | None = None
     """JSON file for the result."""
     sheet: Path | None = None
-    """png or jpg file for 12 frames of the best and the median of 20 games of A on side 0."""
+    """png, webp or jpg file for 12 frames of the best and the median of 20 games of A on side 0."""
     video: Path | None = None
     """mp4 file for the best of them."""
     renderer: Literal["gl", "software"] = "gl"

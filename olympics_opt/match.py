@@ -33,7 +33,7 @@ def run_match(config: Match) -> int:
         limits=config.limits,
     )
     out = prepare(config.out) if config.out is not None else None
-    for path, suffixes in ((config.video, (".mp4",)), (config.sheet, (".png", ".jpg"))):
+    for path, suffixes in ((config.video, (".mp4",)), (config.sheet, (".png", ".jpg", ".webp"))):
         if path is not None and path.suffix.lower() not in suffixes:
             raise ValueError(f"{path} must end in {' or '.join(suffixes)}")
         if path is not None and config.ladder:

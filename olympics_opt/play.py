@@ -217,7 +217,7 @@ def run_render(config: Render) -> int:
         raise ValueError("give a task and --policy, or --all --out sheet.png for every task")
     if config.out is None and config.sheet is None:
         raise ValueError("give --out FILE.mp4 for a video, --sheet FILE.png for a sheet, or both")
-    for path, suffixes in ((config.out, (".mp4",)), (config.sheet, (".png", ".jpg"))):
+    for path, suffixes in ((config.out, (".mp4",)), (config.sheet, (".png", ".jpg", ".webp"))):
         if path is not None and path.suffix.lower() not in suffixes:
             raise ValueError(f"{path} must end in {' or '.join(suffixes)}")
     played = play(**asked(config), engine=config.engine, record=True)

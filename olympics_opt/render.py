@@ -194,7 +194,8 @@ def render_sheet(
 
     Args:
         recordings: episodes by label (``{"best": ..., "median": ...}``), or in that order.
-        path: PNG file, or a JPEG (``.jpg``) of half the width for a page; written atomically.
+        path: PNG file, or a JPEG or WebP (``.jpg``, ``.webp``) of half the width for a page;
+            written atomically.
         commit: the project's commit, printed with the seed.
         columns: panels in a row; by default as many as suit the sport.
         panel: width and height of a panel (pixels); likewise.
@@ -224,9 +225,13 @@ def render_sheet(
         sheet.paste(strip, (0, y))
         y += strip.height
     buffer = io.BytesIO()
-    if Path(path).suffix.lower() == ".jpg":
-        half = (sheet.width // 2, sheet.height // 2)
-        sheet.resize(half, Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=65, optimize=True)
+    suffix = Path(path).suffix.lower()
+    if suffix in (".jpg", ".webp"):
+        half = sheet.resize((sheet.width // 2, sheet.height // 2), Image.Resampling.LANCZOS)
+        if suffix == ".jpg":
+            half.save(buffer, "JPEG", quality=65, optimize=True)
+        else:
+            half.save(buffer, "WEBP", quality=70, method=6)
     else:
         sheet.save(buffer, "PNG", optimize=True)
     return write_bytes(path, buffer.getvalue())

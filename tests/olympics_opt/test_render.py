@@ -215,13 +215,15 @@ def test_sheet_has_twelve_panels_for_each_recording(tmp_path: Path) -> None:
         blue = (part[..., 2] > part[..., 0] + 70).sum()
         red = (part[..., 0] > part[..., 2] + 70).sum()
         assert blue > 15 and red > 15, f"panel {i}"
-    small = Image.open(render.render_sheet({"best": episode}, tmp_path / "s.jpg", panel=(200, 140)))
-    assert small.format == "JPEG" and small.size == (2 * 200, (62 + 3 * 140) // 2)
-    # In grey: a JPEG keeps colours at half the resolution of brightness.
-    first = image.convert("L").crop((0, 0, 800, 62 + 3 * 140)).resize(small.size)
-    likeness, seen = (np.asarray(x).astype(int) for x in (first, small.convert("L")))
-    gap, mirrored = (np.abs(likeness - seen[:, ::way]).mean() for way in (1, -1))
-    assert gap < 0.3 * mirrored, (gap, mirrored)
+    for suffix, kind in ((".jpg", "JPEG"), (".webp", "WEBP")):
+        page = tmp_path / f"s{suffix}"
+        small = Image.open(render.render_sheet({"best": episode}, page, panel=(200, 140)))
+        assert small.format == kind and small.size == (2 * 200, (62 + 3 * 140) // 2)
+        # In grey: both keep colours at half the resolution of brightness.
+        first = image.convert("L").crop((0, 0, 800, 62 + 3 * 140)).resize(small.size)
+        likeness, seen = (np.asarray(x).astype(int) for x in (first, small.convert("L")))
+        gap, mirrored = (np.abs(likeness - seen[:, ::way]).mean() for way in (1, -1))
+        assert gap < 0.3 * mirrored, (suffix, gap, mirrored)
     assert not list(tmp_path.glob("*.tmp"))
     with pytest.raises(ValueError, match="at least one"):
         render.render_sheet({}, tmp_path / "t.png")
