@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from sports import combat
+from sports import boxing, combat, fencing
 from sports.env import make_env, make_scene
 from sports.physics import PhysicsState, default_state, make_physics
 from tests.sports.bout import Bout, swapped
 
 pytestmark = pytest.mark.parametrize("task", ["fencing", "boxing"])
+WEAPONS = {"boxing": boxing.GLOVES, "fencing": fencing.SWORD}
 
 
 def scattered(env, seed: int) -> PhysicsState:
@@ -511,6 +512,38 @@ def test_rewards_as_the_options_say(task):
     bout.reach_out(0.2)
     bout.begin()
     assert bout.step((0, 500.0)).terms["point"][0].tolist() == [5.0, -5.0]
-    for name in ("point", "knock_down"):
+    bout.env.view.config = config(point=5.0, conceded=0.4)
+    bout.begin()
+    assert bout.step((0, 500.0)).terms["point"][0].tolist() == [5.0, -2.0]
+    for name in ("point", "conceded", "knock_down"):
         with pytest.raises(ValueError, match=f"'{name}' must not be negative"):
             config(**{name: -1.0})
+
+
+def test_a_weapon_that_stays_near_may_earn_nothing(task):
+    """Without the shadow a way towards the opponent is paid once, and again after half a second
+    without contact: by what is nearer than where the weapon was then."""
+    bout = Bout(task)
+    bout.env.view.config = type(bout.env.view.config)(shadow=False)
+
+    def at(distance: float, *hits: tuple) -> float:
+        bout.reach_out(distance)
+        return float(bout.step(*hits).terms["strike"][0, 0])
+
+    def worth(distance: float) -> float:
+        bout.reach_out(distance)
+        bout.show()
+        squares = combat.gaps(bout.env.view, WEAPONS[task]).square().sum(-1)
+        return 0.6 * math.exp(-10.0 * float(squares[0, 0].min()))
+
+    bout.reach_out(0.5)
+    bout.begin()
+    assert at(0.5) == 0.0  # where it began
+    assert at(0.3) == pytest.approx(worth(0.3) - worth(0.5), abs=1e-6)
+    assert at(0.3) == at(0.4) == 0.0
+    assert at(0.25) == pytest.approx(worth(0.25) - worth(0.3), abs=1e-6)
+    assert at(0.2, (0, 200.0)) == pytest.approx(worth(0.2) - worth(0.25), abs=1e-6)
+    # No way is paid while it cannot score; then what is nearer than at the end of that time.
+    paid = [at(0.1 if i < 10 else 0.4) for i in range(15)]
+    assert paid == [0.0] * 15 and bout.env.memory["wait"][0, 0] == 0.0
+    assert at(0.3) == pytest.approx(worth(0.3) - worth(0.4), abs=1e-6)
