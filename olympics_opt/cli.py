@@ -341,6 +341,9 @@ class Match:
     """Strength of the athletes; by default the one the first policy was trained with."""
     limits: Literal["paper", "anatomical"] | None = None
     """Joint ranges; by default those the first policy was trained with."""
+    options: tuple[str, ...] = ()
+    """Options of the task, ``NAME=VALUE`` each: ``--options part=true`` sends a referee into a
+    boxing ring."""
 
 
 @dataclass(frozen=True)

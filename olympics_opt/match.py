@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from olympics_opt.progress import progress
@@ -31,6 +34,7 @@ def run_match(config: Match) -> int:
         worlds=config.worlds,
         strength=config.strength,
         limits=config.limits,
+        options=task_options(task, config.options),
     )
     out = prepare(config.out) if config.out is not None else None
     for path, suffixes in ((config.video, (".mp4",)), (config.sheet, (".png", ".jpg", ".webp"))):
@@ -59,6 +63,40 @@ def run_match(config: Match) -> int:
     return 0
 
 
+def task_options(task: str, settings: Sequence[str]) -> dict[str, Any]:
+    """Options of a task from ``NAME=VALUE`` each; a value is JSON, or else a word.
+
+    Raises ValueError for a setting without ``=``, an unknown option, a value that it does not take.
+    """
+    from sports.registry import get_task, make_config
+
+    found: dict[str, Any] = {}
+    known = {field.name for field in dataclasses.fields(get_task(task).config)}
+    for setting in settings:
+        name, equals, value = setting.partition("=")
+        name = name.replace("-", "_")
+        if not equals or name not in known:
+            raise ValueError(
+                f"'{setting}' is no NAME=VALUE of an option of {task}: {', '.join(sorted(known))}"
+            )
+        try:
+            found[name] = json.loads(value)
+        except json.JSONDecodeError:
+            found[name] = value
+        kind = type(getattr(get_task(task).config(), name))
+        if kind in (bool, int, float, str) and not _fits(found[name], kind):
+            raise ValueError(f"option '{name}' of {task} takes no '{value}'")
+    make_config(get_task(task), found)
+    return found
+
+
+def _fits(value: Any, kind: type) -> bool:
+    """Whether JSON's value is of a kind; a whole number is a float, true is no number."""
+    if kind is float and type(value) is int:
+        return True
+    return type(value) is kind
+
+
 def _draw(config: Match, setting: Setting) -> None:
     """The sheet and the video, of games with the first policy on side 0."""
     from olympics_opt.render import render_sheet, render_video
@@ -77,6 +115,7 @@ def _draw(config: Match, setting: Setting) -> None:
         num_worlds=setting.worlds,
         strength=setting.strength,
         limits=setting.limits,
+        options=setting.options,
         record=1,
     )
     if config.sheet is not None:

@@ -134,6 +134,14 @@ def test_the_command_writes_a_result_of_the_schema(tmp_path, capsys):
     assert result["metrics"]["elo_difference"]["mean"] is None  # infinite
     assert result["metrics"]["elo_difference"]["ci95"][0] > 0.0
     assert "wins" in capsys.readouterr().out
-    for wrong in (["zero"], ["zero", "zero", "zero"], ["zero", "nobody", "--task", "boxing"]):
+    args[-1] = str(tmp_path / "parted.json")
+    assert main([*args, "--options", "part=true", "knock-down=2.5"]) == 0
+    parted = json.loads((tmp_path / "parted.json").read_text())
+    assert parted["options"] == {"part": True, "knock_down": 2.5} and result["options"] == {}
+    capsys.readouterr()
+    mistakes = [["zero"], ["zero", "zero", "zero"], ["zero", "nobody", "--task", "boxing"]]
+    for setting in ("part", "parts=true", "part=2", "point=-1", "point=true", "point=x"):
+        mistakes.append(["zero", "random", "--task", "boxing", "--options", setting])
+    for wrong in mistakes:
         assert main(["match", *wrong]) == 2
         assert len(capsys.readouterr().err.strip().splitlines()) == 1
