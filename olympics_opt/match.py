@@ -71,7 +71,8 @@ def task_options(task: str, settings: Sequence[str]) -> dict[str, Any]:
     from sports.registry import get_task, make_config
 
     found: dict[str, Any] = {}
-    known = {field.name for field in dataclasses.fields(get_task(task).config)}
+    default = get_task(task).config()
+    known = {field.name for field in dataclasses.fields(default)}
     for setting in settings:
         name, equals, value = setting.partition("=")
         name = name.replace("-", "_")
@@ -83,7 +84,7 @@ def task_options(task: str, settings: Sequence[str]) -> dict[str, Any]:
             found[name] = json.loads(value)
         except json.JSONDecodeError:
             found[name] = value
-        kind = type(getattr(get_task(task).config(), name))
+        kind = type(getattr(default, name))
         if kind in (bool, int, float, str) and not _fits(found[name], kind):
             raise ValueError(f"option '{name}' of {task} takes no '{value}'")
     make_config(get_task(task), found)

@@ -249,11 +249,11 @@ def advance(
     touches = memory["touches"] + scored
 
     facing, velocity = approach(view)
-    strike = nearness(squares) * free
-    nearest = torch.maximum(memory["nearest"], strike)
+    strike, nearest = nearness(squares) * free, memory["nearest"]
     if not view.config.shadow:
-        nearest = torch.where(~ready & (wait <= 0), strike, nearest)
-        strike = (strike - memory["nearest"]).clamp(min=0.0) * ready
+        closest = torch.maximum(nearest, strike)
+        closest = torch.where(~ready & (wait <= 0), strike, closest)
+        strike, nearest = (strike - nearest).clamp(min=0.0) * ready, closest
         if view.config.part:
             nearest = nearest.masked_fill(holding[:, None], 0.0)
     conceded = view.config.conceded * scored.flip(1)
