@@ -317,8 +317,9 @@ class Match:
     policies: Positional[Annotated[tuple[str, ...], arg(metavar="A B")]]
     """Run folders, policy files, ``pretrained[:ALGO[-STRENGTH]]``, ``zero`` or ``random``; also the
     frozen opponents of a run of self-play, ``RUN@SAMPLES`` and ``RUN@rival``."""
-    task: str = ""
-    """Sport with two sides; by default the one that the first run or file was trained on."""
+    sport: Annotated[str, arg(name="task")] = ""
+    """Sport with two sides; by default the one that the first run or file was trained on. Its
+    options are ``--task.NAME``; together with this one ``--help`` lists them."""
     ladder: bool = False
     """A round robin of two or more policies."""
     out: Path | None = None
@@ -341,9 +342,6 @@ class Match:
     """Strength of the athletes; by default the one the first policy was trained with."""
     limits: Literal["paper", "anatomical"] | None = None
     """Joint ranges; by default those the first policy was trained with."""
-    options: tuple[str, ...] = ()
-    """Options of the task, ``NAME=VALUE`` each: ``--options part=true`` sends a referee into a
-    boxing ring."""
 
 
 @dataclass(frozen=True)
@@ -366,6 +364,9 @@ class Command:
     options: Literal["problem", "task", ""] = ""
     """Prefix of the options of the named problem or task."""
     summary: str = ""
+    finds: str = ""
+    """``module:function`` that tells from the arguments whose options may be set, or None; by
+    default it is NAME."""
 
     def help(self) -> str:
         """One line for the overview."""
@@ -388,7 +389,9 @@ COMMANDS: dict[str, Command] = {
     "mocap": Command(
         None, "olympics_opt.mocap:main", summary="Make clips of recorded motions of people."
     ),
-    "match": Command(Match, "olympics_opt.match:run_match"),
+    "match": Command(
+        Match, "olympics_opt.match:run_match", "task", finds="olympics_opt.match:find_task"
+    ),
     "tracker": Command(Tracker, "olympics_opt.tracker:run_tracker"),
     "likeness": Command(Likeness, "olympics_opt.likeness:run_likeness"),
     "prior": Command(
@@ -456,16 +459,19 @@ def run(name: str, args: list[str]) -> int:
 
 
 def parse(name: str, command: Command, args: list[str]) -> Any:
-    """The config of a command line; options of its problem or task are in ``config.options``.
+    """The config of a command line; options of its problem or task are in its field of that name.
 
-    Raises UsageError for an unknown problem, task or option of it; exits through tyro (code 2)
+    Raises ValueError for an unknown problem, task or option of it; exits through tyro (code 2)
     for anything else that is wrong.
     """
     assert command.config is not None
     config_type: Any = command.config
     if command.options:
         word = command.options
-        chosen = _positional(config_type, args)
+        if command.finds:
+            chosen = _load(command.finds)(args)
+        else:
+            chosen = next(iter(words_and_values(config_type, args)[0]), None)
         options = _option_type(word, chosen) if chosen is not None else None
         if options is not None:
             _check_options(word, str(chosen), options, args)
@@ -480,8 +486,13 @@ def parse(name: str, command: Command, args: list[str]) -> Any:
 
 
 def chosen_options(config: Any, word: str) -> dict[str, Any]:
-    """The options of the problem or task that differ from their defaults, by field name."""
-    options = getattr(config, word)
+    """The options of the problem or task that differ from their defaults, by field name.
+
+    None do where the command line did not say whose options they are.
+    """
+    options = getattr(config, word, None)
+    if options is None:
+        return {}
     default = type(options)()
     return {
         f.name: getattr(options, f.name)
@@ -520,25 +531,33 @@ def sentence(error: BaseException) -> str:
     return text or type(error).__name__
 
 
-def _load(place: str) -> Callable[..., int | None]:
-    module, function = place.split(":")
-    return getattr(importlib.import_module(module), function)
-
-
-def _positional(config_type: type, args: Sequence[str]) -> str | None:
-    """The NAME of a command line: the first word that is neither an option nor its value."""
+def words_and_values(config_type: type, args: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """What is neither an option nor its value on a command line; and the values, by option."""
     flags = {f.name for f in dataclasses.fields(config_type) if f.type in ("bool", bool)}
     flags |= {f"no_{name}" for name in flags} | {"help", "h"}
-    skip = False
+    words: list[str] = []
+    values: dict[str, str] = {}
+    option = ""
     for word in args:
-        if skip:
-            skip = False
+        if option and not word.startswith("--"):
+            values[option] = word
+            option = ""
         elif word.startswith("-") and len(word) > 1:
-            plain = word.lstrip("-").replace("-", "_")
-            skip = "=" not in word and plain not in flags and not _is_switch(plain)
+            plain, equals, value = word.lstrip("-").partition("=")
+            plain = plain.replace("-", "_")
+            option = ""
+            if equals:
+                values[plain] = value
+            elif plain not in flags and not _is_switch(plain):
+                option = plain
         else:
-            return word
-    return None
+            words.append(word)
+    return words, values
+
+
+def _load(place: str) -> Callable[..., Any]:
+    module, function = place.split(":")
+    return getattr(importlib.import_module(module), function)
 
 
 def _is_switch(option: str) -> bool:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -19,13 +17,15 @@ DRAWN = 20
 
 def run_match(config: Match) -> int:
     """The command. Raises ValueError for policies or a task that cannot be used."""
+    from olympics_opt.cli import chosen_options
+    from olympics_opt.play import check_pictures
     from rl.match import Setting, play_ladder, play_match, task_of
     from warmstart.atomic import prepare, write_json
 
     names = config.policies
     if len(names) < 2 or (len(names) > 2 and not config.ladder):
         raise ValueError("give two policies, or --ladder and two or more")
-    task = task_of(names, config.task)
+    task = task_of(names, config.sport)
     setting = Setting(
         task=task,
         trials=config.trials,
@@ -34,14 +34,12 @@ def run_match(config: Match) -> int:
         worlds=config.worlds,
         strength=config.strength,
         limits=config.limits,
-        options=task_options(task, config.options),
+        options=chosen_options(config, "task"),
     )
     out = prepare(config.out) if config.out is not None else None
-    for path, suffixes in ((config.video, (".mp4",)), (config.sheet, (".png", ".jpg", ".webp"))):
-        if path is not None and path.suffix.lower() not in suffixes:
-            raise ValueError(f"{path} must end in {' or '.join(suffixes)}")
-        if path is not None and config.ladder:
-            raise ValueError("a ladder is not drawn: leave --sheet and --video out")
+    check_pictures(config.video, config.sheet)
+    if config.ladder and (config.video is not None or config.sheet is not None):
+        raise ValueError("a ladder is not drawn: leave --sheet and --video out")
     with progress(f"{task}, {config.engine}") as bar:
 
         def show(done: int, total: int) -> None:
@@ -63,39 +61,22 @@ def run_match(config: Match) -> int:
     return 0
 
 
-def task_options(task: str, settings: Sequence[str]) -> dict[str, Any]:
-    """Options of a task from ``NAME=VALUE`` each; a value is JSON, or else a word.
+def find_task(args: Sequence[str]) -> str | None:
+    """The task whose options a command line may set: the one it names, else, where it has such
+    options, that of the first policy with a card.
 
-    Raises ValueError for a setting without ``=``, an unknown option, a value that it does not take.
+    Raises ValueError where it has options and nothing says of what, PolicyError for a policy that
+    cannot be read.
     """
-    from sports.registry import get_task, make_config
+    from olympics_opt.cli import Match, words_and_values
 
-    found: dict[str, Any] = {}
-    default = get_task(task).config()
-    known = {field.name for field in dataclasses.fields(default)}
-    for setting in settings:
-        name, equals, value = setting.partition("=")
-        name = name.replace("-", "_")
-        if not equals or name not in known:
-            raise ValueError(
-                f"'{setting}' is no NAME=VALUE of an option of {task}: {', '.join(sorted(known))}"
-            )
-        try:
-            found[name] = json.loads(value)
-        except json.JSONDecodeError:
-            found[name] = value
-        kind = type(getattr(default, name))
-        if kind in (bool, int, float, str) and not _fits(found[name], kind):
-            raise ValueError(f"option '{name}' of {task} takes no '{value}'")
-    make_config(get_task(task), found)
-    return found
+    policies, values = words_and_values(Match, args)
+    named = values.get("task", "")
+    if named or not any(word.startswith("--task.") for word in args):
+        return named or None
+    from rl.match import task_of
 
-
-def _fits(value: Any, kind: type) -> bool:
-    """Whether JSON's value is of a kind; a whole number is a float, true is no number."""
-    if kind is float and type(value) is int:
-        return True
-    return type(value) is kind
+    return task_of(policies, "")
 
 
 def _draw(config: Match, setting: Setting) -> None:

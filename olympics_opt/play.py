@@ -206,6 +206,13 @@ def print_metrics(result: dict[str, Any]) -> None:
             console.print(f"[red]{name}: {result[name]} worlds[/red]")
 
 
+def check_pictures(video: Path | None, sheet: Path | None) -> None:
+    """Raises ValueError for a file to draw whose name does not end as its kind must."""
+    for path, suffixes in ((video, (".mp4",)), (sheet, (".png", ".jpg", ".webp"))):
+        if path is not None and path.suffix.lower() not in suffixes:
+            raise ValueError(f"{path} must end in {' or '.join(suffixes)}")
+
+
 def run_render(config: Render) -> int:
     """The command. Raises ValueError without anything to write, RuntimeError without GL."""
     from olympics_opt.render import render_sheet, render_video
@@ -217,9 +224,7 @@ def run_render(config: Render) -> int:
         raise ValueError("give a task and --policy, or --all --out sheet.png for every task")
     if config.out is None and config.sheet is None:
         raise ValueError("give --out FILE.mp4 for a video, --sheet FILE.png for a sheet, or both")
-    for path, suffixes in ((config.out, (".mp4",)), (config.sheet, (".png", ".jpg", ".webp"))):
-        if path is not None and path.suffix.lower() not in suffixes:
-            raise ValueError(f"{path} must end in {' or '.join(suffixes)}")
+    check_pictures(config.out, config.sheet)
     played = play(**asked(config), engine=config.engine, record=True)
     print_training_step(config)
     written: list[Path] = []

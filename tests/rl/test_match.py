@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from olympics_opt.cli import main
+from olympics_opt.cli import COMMANDS, chosen_options, main, parse
+from olympics_opt.match import find_task
 from rl.elo import difference
 from rl.match import Pair, Setting, _half, play_games, play_ladder, play_match, task_of
 from rl.policy import PolicyError
+from rl.pretrained import locate
 from tests.rl.contest import Contest, speaker
 
 TOY = Setting(task="contest", trials=60, worlds=8)
@@ -135,13 +137,33 @@ def test_the_command_writes_a_result_of_the_schema(tmp_path, capsys):
     assert result["metrics"]["elo_difference"]["ci95"][0] > 0.0
     assert "wins" in capsys.readouterr().out
     args[-1] = str(tmp_path / "parted.json")
-    assert main([*args, "--options", "part=true", "knock-down=2.5"]) == 0
+    assert main([*args, "--task.part", "--task.knock-down", "2.5"]) == 0
     parted = json.loads((tmp_path / "parted.json").read_text())
     assert parted["options"] == {"part": True, "knock_down": 2.5} and result["options"] == {}
     capsys.readouterr()
     mistakes = [["zero"], ["zero", "zero", "zero"], ["zero", "nobody", "--task", "boxing"]]
-    for setting in ("part", "parts=true", "part=2", "point=-1", "point=true", "point=x"):
-        mistakes.append(["zero", "random", "--task", "boxing", "--options", setting])
+    mistakes += [["zero", "random", "--task.part"], ["zero", "nobody", "--task.part"]]
+    mistakes.append(["zero", "random", "--task", "boxing", "--task.parts"])
     for wrong in mistakes:
         assert main(["match", *wrong]) == 2
         assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    for value in ("part=2", "point=-1", "point=true", "point=x"):
+        assert main(["match", "zero", "random", "--task", "boxing", f"--task.{value}"]) == 2
+        assert value.partition("=")[2] in capsys.readouterr().err
+
+
+def test_whose_options_are_set_is_found_on_the_line():
+    boxer = str(locate("boxing", "selfplay"))
+    for line, task in (
+        ("zero random", None),
+        (f"{boxer} zero --trials 4", None),
+        ("zero random --task.part --task boxing", "boxing"),
+        ("--task=fencing zero random", "fencing"),
+        (f"zero {boxer} --task.knock-down 2.5", "boxing"),
+        (f"--ladder --task.no-part {boxer} zero random", "boxing"),
+    ):
+        assert find_task(line.split()) == task
+    config = parse("match", COMMANDS["match"], [boxer, "zero", "--task.part"])
+    assert (config.policies, config.sport) == ((boxer, "zero"), "")
+    assert chosen_options(config, "task") == {"part": True}
+    assert chosen_options(parse("match", COMMANDS["match"], [boxer, "zero"]), "task") == {}
