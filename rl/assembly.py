@@ -138,7 +138,7 @@ def assemble(config: TrainConfig, starts: Starts | None, make: MakeEnv) -> Assem
     if first:
         warmup, unseen = _begin_from(first, config, env, agent)
         first_learning = 0 if unseen is None else 1
-    if config.algo == "selfplay":
+    if config.contested:
         opponents = Opponents(config, env, agent)
         parts.append(opponents)
         learned = opponents.play.learned_rows

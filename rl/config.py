@@ -41,10 +41,10 @@ class TrainConfig:
     """Name of the task."""
     out: Path = Path("runs/train")
     """Folder of the run."""
-    algo: Literal["ppo", "amp", "selfplay", "latent", "latent-amp"] = "ppo"
+    algo: Literal["ppo", "amp", "selfplay", "latent", "latent-amp", "latent-selfplay"] = "ppo"
     """Learner: ppo; amp, which also pays for moving like the ``clips``; or selfplay, ppo against
-    itself and its past, for tasks with two sides. With ``--prior`` the first two are latent and
-    latent-amp."""
+    itself and its past, for tasks with two sides. With ``--prior`` they are latent, latent-amp and
+    latent-selfplay."""
     engine: Literal["mujoco", "warp", "drake"] = "mujoco"
     """Physics engine: mujoco needs no GPU, warp needs one, drake is for checking, not training."""
     worlds: int | None = None
@@ -170,11 +170,16 @@ class TrainConfig:
         return self.algo in ("amp", "latent-amp")
 
     @property
+    def contested(self) -> bool:
+        """Whether the learner plays against itself and its past."""
+        return self.algo in ("selfplay", "latent-selfplay")
+
+    @property
     def method(self) -> str:
         """The learner's full name, for cards."""
         if self.prior is None:
             return self.algo
-        return "latent-amp" if self.styled else "latent"
+        return "latent-amp" if self.styled else "latent-selfplay" if self.contested else "latent"
 
     @property
     def num_worlds(self) -> int:
@@ -207,12 +212,10 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
 
     if not c.styled and c.amp != AMPConfig():
         yield "the --amp options need --algo amp"
-    if c.algo != "selfplay" and c.selfplay != SelfPlayConfig():
+    if not c.contested and c.selfplay != SelfPlayConfig():
         yield "the --selfplay options need --algo selfplay"
-    if c.algo == "selfplay" and c.clone:
+    if c.contested and c.clone:
         yield "cloning shows one athlete's episode: leave --algo selfplay out"
-    if c.algo == "selfplay" and c.prior is not None:
-        yield "selfplay does not play through a latent prior yet: leave --prior out"
     if c.styled and c.task == TRACKING:
         yield "the tracker follows its clips frame by frame: leave --algo amp out"
 

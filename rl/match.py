@@ -68,6 +68,9 @@ class Pair(Policy):
             raise ValueError(f"task '{env.task.name}' has no two sides: there is no match to play")
         for policy in self.sides:
             policy.check(env)
+        if any(policy.own_turns for policy in self.sides):
+            sides = torch.tensor([policy.own_turns for policy in self.sides], device=env.device)
+            env.own_turns = sides.repeat_interleave(env.num_agents // 2)
 
 
 def _against(first: Policy, second: Policy) -> str:

@@ -34,7 +34,7 @@ from warmstart.atomic import write_bytes, write_text
 
 FORMAT = "olympics-opt policy 1"
 BASELINES = ("zero", "random")
-ALGORITHMS = ("ppo", "amp", "selfplay", "latent", "latent-amp")
+ALGORITHMS = ("ppo", "amp", "selfplay", "latent", "latent-amp", "latent-selfplay")
 """Those whose actor turns an observation into PD targets, which is what a policy is here, or into
 latents of a prior (``latent``), which it is told of by its card."""
 MAX_WIDTH, MAX_LAYERS = 1 << 16, 32
@@ -134,6 +134,11 @@ class Policy:
                 f"the policy was trained on another layout of the observations of "
                 f"'{env.task.name}': train it again with this version"
             )
+
+    @property
+    def own_turns(self) -> bool:
+        """Whether it asks for rotations, on whatever turn a joint is; see ``Env.own_turns``."""
+        return self.layer is not None
 
     def _check_latent(self, env: Any) -> int:
         """Numbers of the action of a latent policy in an environment, which gets a layer to play
@@ -286,7 +291,7 @@ def _from_pool(run: Path, which: str) -> Policy:
         "obs_std": std.tolist(),
         "sha256": hashlib.sha256(save(weights)).hexdigest(),
     }
-    return _build(card, weights, f"{run}@{which}")
+    return _with_prior(_build(card, weights, f"{run}@{which}"), run)
 
 
 def _from_file(path: Path) -> Policy:

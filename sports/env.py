@@ -110,9 +110,10 @@ class Env:
             scene.action_offset(), dtype=torch.float32, device=self.device
         )
         """(act,) PD targets of action 0 (rad)."""
-        self.own_turns = False
+        self.own_turns: bool | Tensor = False
         """Take targets on the turn that each joint is on: of a policy that learned rotations, not
-        on which of its two triples of angles a joint stands, which no observation shows."""
+        on which of its two triples of angles a joint stands, which no observation shows. A tensor
+        (A,) says so of each athlete."""
         foot = [name.endswith(("Ankle", "Toe")) or name in task.tools for name in body.link_names]
         n = self.num_worlds
         self.age = torch.zeros(n, dtype=torch.long, device=self.device)
@@ -190,12 +191,15 @@ class Env:
         if self.task.targets is not None:
             return self.task.targets(self.view, self.memory, limited)
         targets = torch.addcmul(self.action_offset, limited, self.action_scale)
-        if not self.own_turns:
+        if self.own_turns is False:
             return targets
         whole = 7 + self.physics.scene.body.num_dofs
         athletes = self.physics.qpos[:, : self.num_agents * whole]
         hinges = athletes.unflatten(1, (self.num_agents, whole))[..., 7:]
-        return nearest_turn(targets, hinges)[0]
+        nearest = nearest_turn(targets, hinges)[0]
+        if self.own_turns is True:
+            return nearest
+        return torch.where(self.own_turns[:, None], nearest, targets)
 
     def _step(self, action: Tensor) -> StepResult:
         ctrl = self.targets(action)

@@ -22,12 +22,14 @@ from rl.amp import AMPConfig
 from rl.checkpoint import checkpoints, load_checkpoint
 from rl.evaluate import evaluate, standing_starts
 from rl.latent_action import LatentConfig
+from rl.match import Pair, Setting, play_match
 from rl.policy import PolicyError, export_policy, load_policy
 from rl.ppo import PPOConfig
 from rl.prior import PriorError, load_prior, save_prior
 from rl.prior_check import check_prior
 from rl.prior_play import Sampler, play_prior, upright_frames
 from rl.runlog import read_progress
+from rl.selfplay import SelfPlayConfig
 from rl.student import Student
 from rl.tracker_evaluation import evaluate_tracker
 from rl.train import TrainConfig, train
@@ -300,6 +302,54 @@ def test_it_goes_with_a_style_and_an_arm(folder, tmp_path):
     with pytest.raises(PolicyError, match="acts through another latent prior"):
         train(replace(seeing, latent=LatentConfig(arm_residual=0.2)))
     train(seeing)
+
+
+def test_two_sides_play_through_one_prior(folder, tmp_path):
+    few = SelfPlayConfig(pool=4, snapshot_samples=200, ladder=(100,))
+    config = task_config(
+        folder,
+        tmp_path / "whole",
+        task="fencing",
+        algo="selfplay",
+        selfplay=few,
+        latent=LatentConfig(arm_residual=0.2),
+    )
+    train(config)
+    run = tmp_path / "whole"
+    card = load_policy(run, "fencing").metadata
+    arms = 15
+    assert card["algo"] == "latent-selfplay" and card["action_size"] == 6 + arms
+    # A frozen opponent acts through the same prior.
+    first = load_policy(f"{run}@0", "fencing")
+    assert first.prior is not None and first.prior.digest == card["latent"]["prior_digest"]
+
+    parts = replace(config, out=tmp_path / "parts")
+    train(parts, part=0.5)
+    train(replace(parts, resume=True))
+    same_bits(run, parts.out)
+
+    # In a match each athlete acts as it learned to: through the prior on its own turns, or not.
+    latest = load_policy(run, "fencing")
+    env = make_env("fencing", num_worlds=2, training=False)
+    pair = Pair(latest, load_policy("zero", "fencing"))
+    pair.check(env)
+    assert isinstance(env.own_turns, torch.Tensor) and env.own_turns.tolist() == [True, False]
+    obs = env.reset()
+    action = pair(obs)
+    prior = load_prior(folder / "prior")
+    mean, sigma = prior.moments(obs[:, :1])
+    assert latest.actor is not None and latest.layer is not None
+    told = latest.actor(((obs[:, :1] - latest.mean) / latest.std).clamp(-5, 5))
+    decoded = prior.decode(obs[:, :1], mean + 2.5 * sigma * torch.tanh(told[..., :6]))
+    arm = action[:, :1] - (decoded - env.action_offset / env.action_scale)
+    moved = (arm.abs() > 1e-5).any(0)[0]
+    assert 0 < int(moved.sum()) <= arms
+    assert float(arm.abs().max()) <= 0.2 / float(env.action_scale.min()) + 1e-5
+    assert float(action[:, 1].abs().max()) == 0.0
+    env.close()
+    match = play_match(f"{run}@0", run, Setting("fencing", trials=4, worlds=2))
+    assert match["algo"] == "latent-selfplay against latent-selfplay"
+    assert match["metrics"]["score"]["n"] + match["unrated"] == 4
 
 
 def test_an_evaluation_is_stepping_by_hand(folder, tmp_path, monkeypatch):

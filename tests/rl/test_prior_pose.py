@@ -168,6 +168,11 @@ def test_each_of_two_athletes_has_its_own_turns():
     expected = torch.zeros_like(plain)
     expected[1, 1, 12:15] = 1.0
     torch.testing.assert_close(moved, expected, atol=1e-6, rtol=0)
+    # Of each athlete by itself: who plays by rotations may meet who does not.
+    for second in (True, False):
+        env.own_turns = torch.tensor([not second, second])
+        moved = (env.targets(zero) - plain) / (2.0 * math.pi)
+        torch.testing.assert_close(moved, second * expected, atol=1e-6, rtol=0)
     env.close()
 
 
