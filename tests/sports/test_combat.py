@@ -284,7 +284,8 @@ def test_who_holds_earns_nothing_until_both_have_stepped_apart(task):
 
 def test_a_referee_parts_who_hold_and_the_bout_goes_on(task):
     """In the world that held for a second, and there alone; points stay, a blow counts again."""
-    env = make_env(task, num_worlds=2, options={"part": True}, training=False)
+    options = {"part": True, "reach": 2.0}
+    env = make_env(task, num_worlds=2, options=options, training=False)
     env.reset()
     scene, physics = env.physics.scene, env.physics
     guard = physics.qpos.clone()
@@ -313,6 +314,9 @@ def test_a_referee_parts_who_hold_and_the_bout_goes_on(task):
     assert not after.move.mask.any() and after.terms["point"][0].abs().max() == 0.0  # out of reach
     assert after.memory["touches"].tolist() == [[2.0, 1.0]] * 2
     assert after.memory["close_steps"][0] == 0.0 and not after.memory["holding"].any()
+    # The way back on guard is no step away, nor is the way from there one that was gone before.
+    assert last.memory["gap"][0].isinf().all() and after.memory["gap"].isfinite().all()
+    assert not last.terms["reach"][0].any() and not after.terms["reach"][0].any()
 
 
 def test_each_athlete_has_its_own_half_second(task):
@@ -515,7 +519,7 @@ def test_rewards_as_the_options_say(task):
     bout.env.view.config = config(point=5.0, conceded=0.4)
     bout.begin()
     assert bout.step((0, 500.0)).terms["point"][0].tolist() == [5.0, -2.0]
-    for name in ("point", "conceded", "knock_down"):
+    for name in ("point", "conceded", "reach", "knock_down"):
         with pytest.raises(ValueError, match=f"'{name}' must not be negative"):
             config(**{name: -1.0})
 
@@ -547,3 +551,29 @@ def test_a_weapon_that_stays_near_may_earn_nothing(task):
     paid = [at(0.1 if i < 10 else 0.4) for i in range(15)]
     assert paid == [0.0] * 15 and bout.env.memory["wait"][0, 0] == 0.0
     assert at(0.3) == pytest.approx(worth(0.3) - worth(0.4), abs=1e-6)
+
+
+def test_each_metre_towards_the_opponent_may_be_paid(task):
+    """By what is nearer than ever, from where the weapon was when it could score again."""
+    bout = Bout(task)
+    bout.env.view.config = type(bout.env.view.config)(reach=3.0)
+
+    def at(distance: float, *hits: tuple) -> float:
+        bout.reach_out(distance)
+        return float(bout.step(*hits).terms["reach"][0, 0])
+
+    def gap(distance: float) -> float:
+        bout.reach_out(distance)
+        bout.show()
+        squares = combat.gaps(bout.env.view, WEAPONS[task]).square().sum(-1)
+        return math.sqrt(float(squares[0, 0].min()))
+
+    bout.reach_out(0.9)
+    bout.begin()
+    assert at(0.9) == 0.0
+    assert at(0.6) == pytest.approx(3.0 * (gap(0.9) - gap(0.6)), abs=1e-5)
+    assert at(0.8) == at(0.6) == 0.0
+    assert at(0.3, (0, 200.0)) == pytest.approx(3.0 * (gap(0.6) - gap(0.3)), abs=1e-5)
+    paid = [at(0.1 if i < 10 else 0.4) for i in range(15)]
+    assert paid == [0.0] * 15 and bout.env.memory["wait"][0, 0] == 0.0
+    assert at(0.3) == pytest.approx(3.0 * (gap(0.4) - gap(0.3)), abs=1e-5)
