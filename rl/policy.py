@@ -291,7 +291,9 @@ def _from_pool(run: Path, which: str) -> Policy:
         "obs_std": std.tolist(),
         "sha256": hashlib.sha256(save(weights)).hexdigest(),
     }
-    return _with_prior(_build(card, weights, f"{run}@{which}"), run)
+    policy = _build(card, weights, f"{run}@{which}")
+    policy.prior = learner.prior
+    return policy
 
 
 def _from_file(path: Path) -> Policy:

@@ -261,15 +261,15 @@ def advance(
 
     facing, velocity = approach(view)
     strike, nearest = nearness(squares) * free, memory["nearest"]
+    again = ~ready & (wait <= 0)  # may score again from now on
     if not view.config.shadow:
         closest = torch.maximum(nearest, strike)
-        closest = torch.where(~ready & (wait <= 0), strike, closest)
+        closest = torch.where(again, strike, closest)
         strike, nearest = (strike - nearest).clamp(min=0.0) * ready, closest
         if view.config.part:
             nearest = nearest.masked_fill(holding[:, None], 0.0)
     before, gap = memory["gap"], least_gap(squares)  # infinite after parting
-    gained = (before - gap).clamp(min=0.0).masked_fill(before.isinf() | gap.isinf(), 0.0)
-    afresh = (~ready & (wait <= 0)) | gap.isinf()
+    gained = (before - gap).clamp(min=0.0).masked_fill(before.isinf(), 0.0)
     conceded = view.config.conceded * scored.flip(1)
     terms = {
         "facing": FACING * facing,
@@ -298,7 +298,7 @@ def advance(
         memory={
             "squares": squares,
             "nearest": nearest,
-            "gap": torch.where(afresh, gap, torch.minimum(before, gap)),
+            "gap": torch.where(again | gap.isinf(), gap, torch.minimum(before, gap)),
             "wait": wait,
             "touches": touches,
             "since_contact": since_contact,

@@ -524,6 +524,14 @@ def test_rewards_as_the_options_say(task):
             config(**{name: -1.0})
 
 
+def least_square(bout: Bout, task: str, distance: float) -> float:
+    """Least squared distance (m^2) of athlete 0's weapons from the targets, reaching out so far."""
+    bout.reach_out(distance)
+    bout.show()
+    squares = combat.gaps(bout.env.view, WEAPONS[task]).square().sum(-1)
+    return float(squares[0, 0].min())
+
+
 def test_a_weapon_that_stays_near_may_earn_nothing(task):
     """Without the shadow a way towards the opponent is paid once, and again after half a second
     without contact: by what is nearer than where the weapon was then."""
@@ -535,10 +543,7 @@ def test_a_weapon_that_stays_near_may_earn_nothing(task):
         return float(bout.step(*hits).terms["strike"][0, 0])
 
     def worth(distance: float) -> float:
-        bout.reach_out(distance)
-        bout.show()
-        squares = combat.gaps(bout.env.view, WEAPONS[task]).square().sum(-1)
-        return 0.6 * math.exp(-10.0 * float(squares[0, 0].min()))
+        return 0.6 * math.exp(-10.0 * least_square(bout, task, distance))
 
     bout.reach_out(0.5)
     bout.begin()
@@ -563,10 +568,7 @@ def test_each_metre_towards_the_opponent_may_be_paid(task):
         return float(bout.step(*hits).terms["reach"][0, 0])
 
     def gap(distance: float) -> float:
-        bout.reach_out(distance)
-        bout.show()
-        squares = combat.gaps(bout.env.view, WEAPONS[task]).square().sum(-1)
-        return math.sqrt(float(squares[0, 0].min()))
+        return math.sqrt(least_square(bout, task, distance))
 
     bout.reach_out(0.9)
     bout.begin()
