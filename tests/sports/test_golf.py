@@ -234,6 +234,23 @@ def test_reach_pays_for_every_new_metre_once():
     assert stroke.step([HEAD]).terms["reach"][0, 0] == 0
 
 
+def test_aim_pays_for_every_metre_to_the_target_and_charges_every_metre_from_it():
+    stroke = addressed(aim=3.0)
+    target = torch.tensor([10.0, 0.0, 0.0])
+    assert stroke.step().terms["aim"][0, 0] == 0  # not hit yet
+    places = ((0.5, 0.0, 0.3), (8.0, 1.0, 0.5), (14.0, 2.0, 0.02), (90.0, 2.0, 0.02))
+    off = math.dist(ON_TEE, target)
+    for place in places:
+        stroke.ball(place, (12.0, 0.0, 0.0))
+        paid = float(stroke.step([HEAD] if place == places[0] else []).terms["aim"][0, 0])
+        now = min(math.dist(place, target), 40.0)
+        assert paid == pytest.approx(3.0 * (off - now), rel=1e-5)
+        off = now
+    stroke.ball((95.0, 2.0, 0.02), (12.0, 0.0, 0.0))
+    assert stroke.step().terms["aim"][0, 0] == 0  # as far as it gets
+    assert "aim" not in struck().step().terms
+
+
 # Ends.
 
 
@@ -387,6 +404,7 @@ def test_options_are_checked():
         ({"terrain": "sand"}, "must be 'waves' or 'flat'"),
         ({"distance": 21.0}, "between 0 and 20 m away, not 21.0"),
         ({"reach": -1.0}, "must not be negative"),
+        ({"aim": -1.0}, "must not be negative"),
     ):
         with pytest.raises(ValueError, match=words):
             make_env("golf", num_worlds=1, options=options)
