@@ -16,7 +16,7 @@ from typing import Any
 
 from warmstart.atomic import write_json
 
-POINTS = 60
+POINTS = 40
 """Rows that are kept, the first and the last among them."""
 DIGITS = 6
 """Of every number that is not whole: more are noise, and most of the file."""
