@@ -237,7 +237,11 @@ def contact_properties(
     return properties
 
 
-def add_ground(plant: MultibodyPlant, friction: float = FRICTION) -> GeometryId:
+def add_ground(
+    plant: MultibodyPlant,
+    name: str = "ground",
+    properties: ProximityProperties | None = None,
+) -> GeometryId:
     """The plane z = 0 on the world body: the top of a box, 1 km wide and 20 m deep.
 
     A box prunes pairs in the broad phase, a half space meets every sphere every step.
@@ -246,8 +250,8 @@ def add_ground(plant: MultibodyPlant, friction: float = FRICTION) -> GeometryId:
         plant.world_body(),
         RigidTransform([0.0, 0.0, -10.0]),
         Box(1000.0, 1000.0, 20.0),
-        "ground",
-        contact_properties(friction),
+        name,
+        properties or contact_properties(),
     )
 
 

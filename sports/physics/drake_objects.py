@@ -12,16 +12,24 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
+from pydrake.geometry import (
+    CollisionFilterDeclaration,
+    GeometryId,
+    GeometrySet,
+    ProximityProperties,
+    SceneGraph,
+)
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, QuaternionFloatingJoint, RigidBody
 
 from sports.humanoid.drake_plant import (
+    FRICTION,
     HOLD_STIFFNESS,
     OBJECT_DISSIPATION,
     OBJECT_STIFFNESS,
     DrakeHumanoid,
+    add_ground,
     add_shapes,
     contact_properties,
     drake_shape,
@@ -33,6 +41,10 @@ BOUNCE_LOSS = 1.7
 """Of Drake's discrete contact without dissipation: ``-ln(restitution) = BOUNCE_LOSS c`` where c is
 the time step times the contact's frequency sqrt(stiffness / mass), for c < 0.2 (measured in drops
 from 1 and 2 m; pi / 2 of an implicit Euler step, the rest is the ground's)."""
+KICK_LOSS = 1.51
+"""The same against surfaces that take nothing, which is what a ball that is kicked meets."""
+KICKED_STIFFNESS = 1e8
+"""Of those surfaces (N/m): all of the spring is the ball's."""
 _HELD = "held"
 
 
@@ -56,6 +68,7 @@ def add_object(
     dissipation: float,
     points: list[GeometryId],
     shapes: list[GeometryId],
+    stiffness: float = OBJECT_STIFFNESS,
 ) -> PlantObject:
     """Adds a scene object; its geometries are appended to ``points`` and ``shapes``."""
     instance = plant.AddModelInstance(obj.name)
@@ -81,7 +94,7 @@ def add_object(
             rigid,
             obj.name,
             obj.shapes,
-            contact_properties(obj.friction, OBJECT_STIFFNESS, dissipation),
+            contact_properties(obj.friction, stiffness, dissipation),
             ground=obj.motion == "free" and obj.meets_ground,
             firm=contact_properties(obj.friction, HOLD_STIFFNESS, dissipation)
             if obj.holdable
@@ -99,7 +112,8 @@ def _add_ball(
     one more for athletes alone, which is firm; then nothing but the ground rubs on the others."""
     assert ball.restitution is not None
     (sphere,) = ball.shapes
-    frequency = -math.log(ball.restitution) / (BOUNCE_LOSS * timestep)
+    loss = BOUNCE_LOSS if ball.holdable else KICK_LOSS
+    frequency = -math.log(ball.restitution) / (loss * timestep)
     stiffness = sphere.mass * frequency**2
     X_BS, geometry = drake_shape(sphere)
     soft, firm = (stiffness, 0.0), (HOLD_STIFFNESS, OBJECT_DISSIPATION)
@@ -132,6 +146,66 @@ def separate_held(
     declare = CollisionFilterDeclaration()
     declare.ExcludeBetween(GeometrySet(soft), GeometrySet(athletes))
     declare.ExcludeBetween(GeometrySet(held), GeometrySet([g for g in shapes if g not in held]))
+    scene_graph.collision_filter_manager().Apply(declare)
+
+
+@dataclass(frozen=True)
+class KickSurfaces:
+    """What balls that are kicked meet instead of ground and athletes, whose own contacts take
+    energy from them, the more the firmer the ball is: the same shapes, firm and without loss."""
+
+    ground: GeometryId
+    links: list[tuple[GeometryId, ...]]
+    """Of all athletes, one row a link, in the order of its shapes."""
+
+
+def add_kick_surfaces(
+    plant: MultibodyPlant, humanoids: Sequence[DrakeHumanoid], ground_friction: float
+) -> KickSurfaces:
+    """Adds them; ``plant`` is not finalized yet."""
+
+    def properties(friction: float) -> ProximityProperties:
+        return contact_properties(friction, KICKED_STIFFNESS, 0.0)
+
+    return KickSurfaces(
+        add_ground(plant, "ground_for_kicks", properties(ground_friction)),
+        [
+            tuple(
+                plant.RegisterCollisionGeometry(
+                    rigid, *drake_shape(shape), f"{link.name}_for_kicks{i}", properties(FRICTION)
+                )
+                for i, shape in enumerate(link.shapes)
+            )
+            for humanoid in humanoids
+            for link, rigid in zip(humanoid.body.links, humanoid.links)
+        ],
+    )
+
+
+def separate_kicked(
+    scene_graph: SceneGraph,
+    plant: MultibodyPlant,
+    humanoids: Sequence[DrakeHumanoid],
+    ground: GeometryId,
+    own: KickSurfaces,
+    points: Sequence[GeometryId],
+    shapes: Sequence[GeometryId],
+    kicked: Sequence[PlantObject],
+) -> None:
+    """Balls that are kicked meet their own ground and athletes, and nothing else does."""
+    balls = {g for ball in kicked for g in plant.GetCollisionGeometriesForBody(ball.rigid)}
+    low, whole = [g for g in points if g in balls], [g for g in shapes if g in balls]
+    limbs = [g for link in own.links for g in link]
+    athletes = [g for h in humanoids for link in h.shapes for g in link]
+    feet = [g for h in humanoids for link in h.points for g in link]
+    usual = [*points, *shapes, *athletes, *feet, ground]
+    declare = CollisionFilterDeclaration()
+    declare.ExcludeWithin(GeometrySet([*limbs, own.ground]))
+    for surface, met in (([own.ground], low), (limbs, whole)):
+        rest = GeometrySet([g for g in usual if g not in met])
+        declare.ExcludeBetween(GeometrySet(surface), rest)
+    declare.ExcludeBetween(GeometrySet(ground), GeometrySet(low))
+    declare.ExcludeBetween(GeometrySet(athletes), GeometrySet(whole))
     scene_graph.collision_filter_manager().Apply(declare)
 
 
