@@ -42,7 +42,8 @@ BOUNCE_LOSS = 1.7
 the time step times the contact's frequency sqrt(stiffness / mass), for c < 0.2 (measured in drops
 from 1 and 2 m; pi / 2 of an implicit Euler step, the rest is the ground's)."""
 KICK_LOSS = 1.51
-"""The same against surfaces that take nothing, which is what a ball that is kicked meets."""
+"""The same against surfaces that take nothing, which is what a ball that is kicked meets (measured
+at 3 to 20 m/s and 1/960 to 1/7680 s: restitution 0.79 to 0.81 where 0.8 is asked for)."""
 KICKED_STIFFNESS = 1e8
 """Of those surfaces (N/m): all of the spring is the ball's."""
 _HELD = "held"
