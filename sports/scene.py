@@ -219,6 +219,11 @@ class Scene:
         return tuple(o for o in self.free_objects if o.restitution is not None)
 
     @property
+    def kicked(self) -> tuple[SceneObject, ...]:
+        """Those of them that no hand holds."""
+        return tuple(o for o in self.bouncing if not o.holdable)
+
+    @property
     def mocap_objects(self) -> tuple[SceneObject, ...]:
         return tuple(o for o in self.objects if o.motion == "mocap")
 

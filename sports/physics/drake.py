@@ -50,13 +50,11 @@ from sports.humanoid.mjcf import build_model
 from sports.physics.base import Geometry, PhysicsState, diverged
 from sports.physics.drake_objects import (
     KICKED_STIFFNESS,
-    KickSurfaces,
     PlantObject,
     add_kick_surfaces,
     add_object,
     floating,
     separate_held,
-    separate_kicked,
 )
 from sports.physics.game import build_game, has_game
 from sports.scene import GROUND, Scene
@@ -113,25 +111,24 @@ class DrakePhysics:
         shapes: list[GeometryId] = []
         self._free: list[PlantObject] = []
         self._fixtures: list[PlantObject] = []
-        kicked = _kicked(scene)
         for obj in scene.objects:
             stiffness, losses = OBJECT_STIFFNESS, OBJECT_DISSIPATION
             if scene.bouncing and obj.motion != "free":
                 losses = 0.0  # a wall must leave a ball the restitution that it has
-                stiffness = KICKED_STIFFNESS if kicked else stiffness
+                stiffness = KICKED_STIFFNESS if scene.kicked else stiffness
             added = add_object(plant, obj, self.timestep, losses, points, shapes, stiffness)
             (self._fixtures if added.frame is not None else self._free).append(added)
-        self._for_kicks: KickSurfaces | None = None
-        if kicked:
-            self._for_kicks = add_kick_surfaces(plant, self._humanoids, scene.ground_friction)
+        self._doubles: dict[GeometryId, GeometryId] = {}
+        if scene.kicked:
+            names = [ball.name for ball in scene.kicked]
+            balls = [o for o in self._free if o.name in names]
+            friction = scene.ground_friction
+            self._doubles = add_kick_surfaces(
+                plant, scene_graph, self._humanoids, ground, friction, points, shapes, balls
+            )
         plant.Finalize()
         filter_collisions(scene_graph, self._humanoids, [ground], points, shapes)
         separate_held(scene_graph, self._humanoids, shapes)
-        if self._for_kicks is not None:
-            balls = [o for o in self._free if o.name in kicked]
-            separate_kicked(
-                scene_graph, plant, self._humanoids, ground, self._for_kicks, points, shapes, balls
-            )
         self.diagram = builder.Build()
         self._roots = [self.diagram.CreateDefaultContext() for _ in range(n)]
         self._contexts = [plant.GetMyMutableContextFromRoot(root) for root in self._roots]
@@ -354,12 +351,11 @@ class DrakePhysics:
                     # A shape of its own gets a number that no body has.
                     names[f"{name}:{k}"] = [-1 - len(self._shape_of)]
                     self._shape_of[shape] = names[f"{name}:{k}"][0]
-                    if self._for_kicks is not None:
-                        row = a * self.scene.body.num_links + i
-                        self._shape_of[self._for_kicks.links[row][k]] = self._shape_of[shape]
             for link in self.scene.body.link_names:
                 beyond = self.scene.body.subtree(link)
                 names[f"agent{a}/{link}/"] = [names[f"agent{a}/{b}"][0] for b in beyond]
+        for double, shape in self._doubles.items():
+            self._shape_of[double] = self._shape_of[shape]
         for obj in [*self._free, *self._fixtures]:
             names[obj.name] = [int(obj.rigid.index())]
         self._pairs_of: dict[tuple[int, int], list[tuple[int, float]]] = {}
@@ -469,16 +465,11 @@ class DrakePhysics:
         self.pair_force = tensor(self._pair)
 
 
-def _kicked(scene: Scene) -> tuple[str, ...]:
-    """Names of the balls that bounce and that no hand holds."""
-    return tuple(ball.name for ball in scene.bouncing if not ball.holdable)
-
-
 def _substeps(scene: Scene, timestep: float | None) -> int:
     """Drake steps in one control step."""
     if timestep is None:
         largest = BOUNCE_TIMESTEP if scene.bouncing else MAX_TIMESTEP
-        if _kicked(scene):
+        if scene.kicked:
             largest = KICK_TIMESTEP
         if any(o.holdable and o.restitution is None for o in scene.objects):
             largest = HOLD_TIMESTEP

@@ -150,64 +150,46 @@ def separate_held(
     scene_graph.collision_filter_manager().Apply(declare)
 
 
-@dataclass(frozen=True)
-class KickSurfaces:
-    """What balls that are kicked meet instead of ground and athletes, whose own contacts take
-    energy from them, the more the firmer the ball is: the same shapes, firm and without loss."""
-
-    ground: GeometryId
-    links: list[tuple[GeometryId, ...]]
-    """Of all athletes, one row a link, in the order of its shapes."""
-
-
 def add_kick_surfaces(
-    plant: MultibodyPlant, humanoids: Sequence[DrakeHumanoid], ground_friction: float
-) -> KickSurfaces:
-    """Adds them; ``plant`` is not finalized yet."""
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    humanoids: Sequence[DrakeHumanoid],
+    ground: GeometryId,
+    ground_friction: float,
+    points: Sequence[GeometryId],
+    shapes: Sequence[GeometryId],
+    kicked: Sequence[PlantObject],
+) -> dict[GeometryId, GeometryId]:
+    """What balls that are kicked meet, and nothing else does, instead of ground and athletes, whose
+    own contacts take energy from them, the more the firmer the ball is: the same shapes, firm and
+    without loss. Which shape of an athlete each of them doubles."""
 
     def properties(friction: float) -> ProximityProperties:
         return contact_properties(friction, KICKED_STIFFNESS, 0.0)
 
-    return KickSurfaces(
-        add_ground(plant, "ground_for_kicks", properties(ground_friction)),
-        [
-            tuple(
-                plant.RegisterCollisionGeometry(
-                    rigid, *drake_shape(shape), f"{link.name}_for_kicks{i}", properties(FRICTION)
-                )
-                for i, shape in enumerate(link.shapes)
-            )
-            for humanoid in humanoids
-            for link, rigid in zip(humanoid.body.links, humanoid.links)
-        ],
-    )
-
-
-def separate_kicked(
-    scene_graph: SceneGraph,
-    plant: MultibodyPlant,
-    humanoids: Sequence[DrakeHumanoid],
-    ground: GeometryId,
-    own: KickSurfaces,
-    points: Sequence[GeometryId],
-    shapes: Sequence[GeometryId],
-    kicked: Sequence[PlantObject],
-) -> None:
-    """Balls that are kicked meet their own ground and athletes, and nothing else does."""
+    floor = add_ground(plant, "ground_for_kicks", properties(ground_friction))
+    doubles = {
+        plant.RegisterCollisionGeometry(
+            rigid, *drake_shape(shape), f"{link.name}_for_kicks{i}", properties(FRICTION)
+        ): geometry
+        for humanoid in humanoids
+        for link, rigid, own in zip(humanoid.body.links, humanoid.links, humanoid.shapes)
+        for i, (shape, geometry) in enumerate(zip(link.shapes, own))
+    }
     balls = {g for ball in kicked for g in plant.GetCollisionGeometriesForBody(ball.rigid)}
     low, whole = [g for g in points if g in balls], [g for g in shapes if g in balls]
-    limbs = [g for link in own.links for g in link]
-    athletes = [g for h in humanoids for link in h.shapes for g in link]
+    limbs, athletes = list(doubles), list(doubles.values())
     feet = [g for h in humanoids for link in h.points for g in link]
     usual = [*points, *shapes, *athletes, *feet, ground]
     declare = CollisionFilterDeclaration()
-    declare.ExcludeWithin(GeometrySet([*limbs, own.ground]))
-    for surface, met in (([own.ground], low), (limbs, whole)):
+    declare.ExcludeWithin(GeometrySet([*limbs, floor]))
+    for surface, met in (([floor], low), (limbs, whole)):
         rest = GeometrySet([g for g in usual if g not in met])
         declare.ExcludeBetween(GeometrySet(surface), rest)
     declare.ExcludeBetween(GeometrySet(ground), GeometrySet(low))
     declare.ExcludeBetween(GeometrySet(athletes), GeometrySet(whole))
     scene_graph.collision_filter_manager().Apply(declare)
+    return doubles
 
 
 def floating(joint: QuaternionFloatingJoint | None) -> tuple[int, int]:

@@ -97,8 +97,8 @@ def test_a_football_rebounds_alike_at_all_speeds_in_drake():
     path = watch(physics, 15)
     z, vz = path[..., 2] - FOOTBALL["radius"], path[..., 5]
     energy = G * z + vz.square() / 2
-    last = ((z > 0.0) & (vz > 0.0)).float().argmax(0)
-    after = energy.gather(0, last[None])[0]
+    rising = ((z > 0.0) & (vz > 0.0)).float().argmax(0)
+    after = energy.gather(0, rising[None])[0]
     before = speed.square() / 2 + G * 0.3
     assert (after / before).sqrt().numpy() == pytest.approx(FOOTBALL["restitution"], abs=0.015)
 
@@ -108,7 +108,6 @@ def kicked_at(name, substeps, **options):
     with the foot."""
     scene = ball_scene(**FOOTBALL, timestep=0.1 / substeps, substeps=substeps)
     physics = engine(name, scene, 1, **options)
-    scene = physics.scene
     foot = physics.body_pos[0, 0, scene.body.link_index("R_Ankle")]
     state = default_state(scene, 1, "cpu")
     q = scene.object_qpos("ball").start
