@@ -34,7 +34,7 @@ from torch import Tensor
 
 from sports.ball import BALLS, landing_on_waves
 from sports.humanoid.body import Body, Shape
-from sports.physics.base import PhysicsState
+from sports.physics.base import GRAVITY, PhysicsState
 from sports.scene import Scene, SceneObject, Start, Surface
 from sports.task import (
     Advance,
@@ -70,6 +70,8 @@ BACKWARDS = 0.05
 """The ball may go this far (m) behind the tee before it lands."""
 KICK = 0.15
 """A link's origin nearer than this (m) to the ball is a kick."""
+MOST_WEIGHTS = 30.0
+"""Body weights of the club on the ground that are counted."""
 REST_SPEED, REST_STEPS = 0.02, 3
 """A ball rests that has been slower than this (m/s) at the end of so many steps in a row: one at
 the top of its path would be falling at 0.33 m/s a step later."""
@@ -95,6 +97,10 @@ class Golf:
     """Reward for each metre that the ball, once hit, comes nearer to the target, and cost of each
     that it goes away from it (40 m off or more are alike); 0 for the paper's terms alone."""
 
+    turf: float = 0.0
+    """Cost of each body weight with which the club presses on the ground, in the substep of each
+    step in which it does so most (30 or more are alike); 0 for the paper's terms alone."""
+
     def __post_init__(self) -> None:
         if self.terrain not in ("waves", "flat"):
             raise ValueError(f"the terrain must be 'waves' or 'flat', not '{self.terrain}'")
@@ -106,6 +112,8 @@ class Golf:
             raise ValueError(f"the reward for reaching must not be negative: {self.reach}")
         if self.aim < 0.0:
             raise ValueError(f"the reward for aiming must not be negative: {self.aim}")
+        if self.turf < 0.0:
+            raise ValueError(f"the cost of turf must not be negative: {self.turf}")
 
 
 def scene(config: Golf, body: Body) -> Scene:
@@ -296,6 +304,10 @@ def advance(view: View, memory: Memory) -> Advance:
         terms["aim"] = (
             config.aim * (was_off.clamp(max=furthest) - off.clamp(max=furthest)) * contact
         )
+    if config.turf > 0.0:
+        force = length(physics.ground_force[:, 0, physics.scene.body.link_index(TOOL)])
+        weights = force / (GRAVITY * physics.scene.body.mass)
+        terms["turf"] = -config.turf * weights.clamp(max=MOST_WEIGHTS)
 
     measures = {
         "error": off,

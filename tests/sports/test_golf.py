@@ -251,6 +251,20 @@ def test_aim_pays_for_every_metre_to_the_target_and_charges_every_metre_from_it(
     assert "aim" not in struck().step().terms
 
 
+def test_turf_charges_for_the_club_on_the_ground_and_for_nothing_else():
+    stroke = addressed(turf=2.0)
+    weight = 9.81 * stroke.env.physics.scene.body.mass
+    for link, force, owed in (
+        ("R_Hand", 1200.0, 1200.0),
+        ("R_Hand", 100 * weight, 30 * weight),  # as bad as it gets
+        ("L_Toe", 1200.0, 0.0),
+        ("R_Hand", 0.0, 0.0),
+    ):
+        paid = float(stroke.step(forces={link: force}).terms["turf"][0, 0])
+        assert paid == pytest.approx(-2.0 * owed / weight, rel=1e-5)
+    assert "turf" not in struck().step().terms
+
+
 # Ends.
 
 
@@ -405,6 +419,7 @@ def test_options_are_checked():
         ({"distance": 21.0}, "between 0 and 20 m away, not 21.0"),
         ({"reach": -1.0}, "must not be negative"),
         ({"aim": -1.0}, "must not be negative"),
+        ({"turf": -1.0}, "must not be negative"),
     ):
         with pytest.raises(ValueError, match=words):
             make_env("golf", num_worlds=1, options=options)
