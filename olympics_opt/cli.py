@@ -150,6 +150,9 @@ class Verify:
     """Seed of all randomness."""
     processes: int = 2
     """Worker processes for Drake."""
+    parting_steps: int = 60
+    """Control steps of four worlds in Drake that MuJoCo plays once more from the same states, to
+    tell where the engines part; 0 to leave that out."""
     strength: Literal["paper", "human"] | None = None
     """Strength of the athlete; by default the one the policy was trained with."""
     limits: Literal["paper", "anatomical"] | None = None

@@ -21,6 +21,8 @@ from warmstart import atomic
 if TYPE_CHECKING:
     from olympics_opt.cli import Verify
 
+PARTING_WORLDS = 4
+"""Whose steps are played in both engines."""
 KEEP = 0.9
 """Share of MuJoCo's success that must remain in Drake."""
 CONFIDENCE = 0.95
@@ -179,9 +181,11 @@ def run_verify(config: Verify) -> int:
 
     if config.trials < 1:
         raise ValueError(f"trials must be at least 1, not {config.trials}")
+    if config.parting_steps < 0:
+        raise ValueError(f"parting-steps must not be negative, not {config.parting_steps}")
     trials = asked(config)
     atomic.prepare(config.out / "report.json")
-    report, recordings = verify(**trials)
+    report, recordings = verify(**trials, parting_steps=config.parting_steps)
     atomic.write_json(config.out / "report.json", report)
     page = Page(
         f"{config.name.replace('_', ' ').capitalize()}: does the result hold in Drake?",
@@ -205,8 +209,10 @@ def verify(
     limits: str | None = None,
     options: dict[str, Any] | None = None,
     processes: int = 2,
+    parting_steps: int = 0,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Parity table first, then the same trials in the three runs.
+    """Parity table first, then the same trials in the three runs, then ``parting_steps`` control
+    steps of a few worlds from the same states in two (``rl.parting``).
 
     Returns the report as JSON values and one recording per run (the median episode). Stops after
     the parity table when the two models differ. Raises ValueError for an unknown task or option,
@@ -231,6 +237,7 @@ def verify(
         "parity": parity,
         "results": {},
         "samples": {},
+        "parting": None,
     }
     if not all(row["ok"] for row in parity):
         verdict = Verdict(False, ("the MuJoCo and the Drake model differ (parity table)",))
@@ -255,7 +262,29 @@ def verify(
         report["options"] = played.result["options"]  # with those of the policy's card
         report["samples"][run] = {k: np.asarray(v).tolist() for k, v in played.trials.items()}
         recordings[run] = played.median
+    if parting_steps:
+        report["parting"] = _parting(report, parting_steps)
     return {**report, **compare(report["results"], report["samples"])}, recordings
+
+
+def _parting(report: Mapping[str, Any], steps: int) -> dict[str, Any]:
+    from olympics_opt.progress import progress
+    from rl.parting import find_parting
+    from rl.policy import load_policy
+
+    with progress(f"playing {report['task']}, step by step in both engines") as bar:
+        found = find_parting(
+            load_policy(report["policy"], report["task"]),
+            report["task"],
+            worlds=PARTING_WORLDS,
+            steps=steps,
+            seed=report["seed"],
+            strength=report["strength"],
+            limits=report["limits"],
+            options=report["options"],
+        )
+        bar.finish(f"{found.steps} steps, {found.velocity:.2f} rad/s apart")
+    return dataclasses.asdict(found)
 
 
 def compare(

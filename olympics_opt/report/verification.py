@@ -11,6 +11,8 @@ from olympics_opt.report import sections
 from olympics_opt.report.page import Block, Fragment, Section, Table, Text, Tile, Tiles, number
 from olympics_opt.report.sections import ENGINE_NAMES, metric_table, parity_section
 
+LINKS_SHOWN = 8
+
 
 def verification_sections(
     report: Mapping[str, Any], recordings: Mapping[str, Any] | None = None
@@ -19,6 +21,8 @@ def verification_sections(
     parts = [_verdict_section(report), parity_section(report["parity"])]
     if report["results"]:
         parts += [_scores_section(report), _distribution_section(report)]
+    if report.get("parting"):
+        parts.append(_parting_section(report["parting"]))
     if recordings:
         parts.append(replay_of(recordings, "replay-verify"))
     parts.append(
@@ -130,6 +134,53 @@ def _distribution_section(report: Mapping[str, Any]) -> Section:
     )
     return Section(
         "Distributions", [sections.distribution_plots(samples, units), *([table] if rows else [])]
+    )
+
+
+def _parting_section(parting: Mapping[str, Any]) -> Section:
+    forces = [
+        [
+            f["athlete"],
+            f["link"],
+            f"{100 * f['touching']:.0f} %",
+            f"{f['other']:.0f}, {f['mujoco']:.0f}",
+            f"{f['other_peak']:.0f}, {f['mujoco_peak']:.0f}",
+            f"{f['blame']:.2f}",
+        ]
+        for f in parting["forces"][:LINKS_SHOWN]
+    ]
+    worst = [
+        [
+            w["world"],
+            f"{w['seconds']:.2f} s",
+            f"{w['velocity']:.2f} rad/s",
+            w["athlete"],
+            w["link"],
+            f"{w['other']:.0f}, {w['mujoco']:.0f}",
+        ]
+        for w in parting["worst"]
+    ]
+    return Section(
+        "Where the engines part",
+        [
+            Table(
+                ["athlete", "link", "touches", "mean N", "99 % N", "correlation"],
+                forces,
+                "The ground on each link, Drake's force and MuJoCo's, in the substep in which it "
+                "is largest (a firm ground peaks higher for the same impulse); and how the "
+                "difference goes with that of the joints' velocities.",
+            ),
+            Table(
+                ["world", "time", "joints apart", "athlete", "link", "N"],
+                worst,
+                "The steps after which the joints' velocities differ most, and the link on which "
+                "the forces then do.",
+            ),
+        ],
+        f"{parting['steps']} control steps of Drake's episodes, each played again by MuJoCo at "
+        f"1/{1.0 / parting['timestep']:.0f} s from the same state with the same targets. Then the "
+        f"joints' velocities differ by {parting['velocity']:.2f} rad/s rms in the median, "
+        f"{parting['velocity_p95']:.2f} in one step of twenty.",
     )
 
 

@@ -110,6 +110,7 @@ def test_a_comparison_of_equal_samples_finds_nothing():
 def test_standing_still_verifies_nothing_and_still_gets_its_report(tmp_path: Path, capsys):
     """The whole command on a policy that only stands: parity first, then scores, then exit 1."""
     line = ["verify", "high_jump", "--policy", "zero", "--trials", "2", "--processes", "1"]
+    line += ["--parting-steps", "5"]
     assert cli.main([*line, "--out", str(tmp_path)]) == 1
     out = capsys.readouterr().out
     assert out.index("mass matrix") < out.index("trials")
@@ -122,6 +123,10 @@ def test_standing_still_verifies_nothing_and_still_gets_its_report(tmp_path: Pat
     assert half == pytest.approx(whole / 2)
     page = (tmp_path / "report.html").read_text()
     assert "Parity of the models" in page and "replay-verify" in page
+    # Standing still, engines hardly part, and only feet touch the ground.
+    assert report["parting"]["steps"] == 4 * 5 and report["parting"]["velocity"] < 0.1
+    assert {f["link"][2:] for f in report["parting"]["forces"]} == {"Ankle", "Toe"}
+    assert "Where the engines part" in page and "MuJoCo at 1/480 s" in page
     for step in ("4 x 1/120 s", "8 x 1/240 s", "16 x 1/480 s"):  # of the three runs
         assert f">{step}<" in page
 
@@ -135,5 +140,6 @@ def test_models_that_differ_are_not_scored(tmp_path: Path, monkeypatch, capsys):
     line = ["verify", "high_jump", "--policy", "zero", "--trials", "2", "--out", str(tmp_path)]
     assert cli.main(line) == 1
     report = json.loads((tmp_path / "report.json").read_text())
-    assert report["results"] == {} and "differ" in report["verdict"]["reasons"][0]
+    assert report["results"] == {} and report["parting"] is None
+    assert "differ" in report["verdict"]["reasons"][0]
     assert "must not be compared" in (tmp_path / "report.html").read_text()
