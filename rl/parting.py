@@ -169,22 +169,20 @@ def _play(policy: Policy, env: Any, mujoco: Any, steps: int) -> _Steps:
     kept: list[tuple[np.ndarray, ...]] = []
     obs = env.reset()
     for _ in range(steps):
-        before, clock = env.physics, env.view.clock.clone()
-        state = PhysicsState(before.qpos.clone(), before.qvel.clone(), before.mocap_pos.clone())
+        physics, clock = env.physics, env.view.clock.clone()
+        state = PhysicsState(physics.qpos, physics.qvel, physics.mocap_pos).clone()
         if scene.has_waves:
-            state.wave_phase = before.wave_phase.clone()
+            state.wave_phase = physics.wave_phase.clone()
         mujoco.reset(everyone, state)
         result = env.step(policy(obs))
         obs = result.obs
         mujoco.step(env.view.ctrl.flatten(1))
         after = env.final_snapshot
-        apart, turned = [], []
-        for a in agents:
-            root = scene.agent_qpos(a).start
-            apart.append((after["qpos"] - mujoco.qpos)[:, root : root + 3].norm(dim=-1))
-            turned.append((after["qvel"] - mujoco.qvel)[:, scene.agent_qvel(a)][:, 6:])
-        whole = result.valid & ~mujoco.bad & (torch.stack(apart).amax(0) < MOVED)
-        rows = whole.nonzero()[:, 0]
+        q, v = after["qpos"] - mujoco.qpos, after["qvel"] - mujoco.qvel
+        roots = [q[:, scene.agent_qpos(a)][:, :3].norm(dim=-1) for a in agents]
+        turned = [v[:, scene.agent_qvel(a)][:, 6:] for a in agents]
+        comparable = result.valid & ~mujoco.bad & (torch.stack(roots).amax(0) < MOVED)
+        rows = comparable.nonzero()[:, 0]
         values = (
             rows,
             (clock + 1)[rows] * scene.control_timestep,
