@@ -21,8 +21,6 @@ from warmstart import atomic
 if TYPE_CHECKING:
     from olympics_opt.cli import Verify
 
-PARTING_WORLDS = 4
-"""Whose steps are played in both engines."""
 KEEP = 0.9
 """Share of MuJoCo's success that must remain in Drake."""
 CONFIDENCE = 0.95
@@ -276,7 +274,6 @@ def _parting(report: Mapping[str, Any], steps: int) -> dict[str, Any]:
         found = find_parting(
             load_policy(report["policy"], report["task"]),
             report["task"],
-            worlds=PARTING_WORLDS,
             steps=steps,
             seed=report["seed"],
             strength=report["strength"],

@@ -17,9 +17,9 @@ import torch
 
 from rl.policy import Policy, as_trained
 from rl.trials import Share, opened
-from sports.env import make_scene
 from sports.physics import make_physics
 from sports.physics.base import PhysicsState
+from sports.scene import finer
 from sports.starts import START_NOISE
 
 FINE = 4
@@ -102,7 +102,7 @@ def find_parting(
     task: str,
     *,
     engine: str = "drake",
-    worlds: int = 8,
+    worlds: int = 4,
     steps: int = 60,
     seed: int = 0,
     strength: str | None = None,
@@ -142,17 +142,9 @@ def find_parting(
         physics_options={},
         timestep_divisor=1,
         start_noise=START_NOISE,
-        record=False,
-        worlds_recorded=(),
-    )
-    scene = make_scene(
-        task,
-        strength=strength,  # type: ignore[arg-type]
-        limits=limits,  # type: ignore[arg-type]
-        options=options,
-        timestep_divisor=divisor,
     )
     with opened(policy, share) as env:
+        scene = finer(env.physics.scene, divisor)
         mujoco = make_physics("mujoco", scene, worlds)
         try:
             found = _play(policy, env, mujoco, steps)
@@ -169,11 +161,8 @@ def _play(policy: Policy, env: Any, mujoco: Any, steps: int) -> _Steps:
     kept: list[tuple[np.ndarray, ...]] = []
     obs = env.reset()
     for _ in range(steps):
-        physics, clock = env.physics, env.view.clock.clone()
-        state = PhysicsState(physics.qpos, physics.qvel, physics.mocap_pos).clone()
-        if scene.has_waves:
-            state.wave_phase = physics.wave_phase.clone()
-        mujoco.reset(everyone, state)
+        p, clock = env.physics, env.view.clock.clone()
+        mujoco.reset(everyone, PhysicsState(p.qpos, p.qvel, p.mocap_pos, p.wave_phase))
         result = env.step(policy(obs))
         obs = result.obs
         mujoco.step(env.view.ctrl.flatten(1))

@@ -252,8 +252,6 @@ def _share(config: Polish, policy: Policy, options: dict[str, Any] | None) -> Sh
         physics_options=physics,
         timestep_divisor=config.timestep_divisor,
         start_noise=config.start_noise,
-        record=False,
-        worlds_recorded=(),
         blocks=config.blocks,
     )
 

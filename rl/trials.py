@@ -43,9 +43,9 @@ class Share:
     physics_options: dict[str, Any]
     timestep_divisor: int
     start_noise: float
-    record: bool
+    record: bool = False
     """Keep what may turn out to be the best or the median."""
-    worlds_recorded: tuple[int, ...]
+    worlds_recorded: tuple[int, ...] = ()
     """Whose first episodes are kept."""
     blocks: int = 1
     """Worlds in so many blocks with the same starts."""

@@ -12,6 +12,7 @@ from olympics_opt.report.page import Block, Fragment, Section, Table, Text, Tile
 from olympics_opt.report.sections import ENGINE_NAMES, metric_table, parity_section
 
 LINKS_SHOWN = 8
+"""Of those on which the engines differ."""
 
 
 def verification_sections(
