@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from sports.ball import crossing, landing
+from sports.physics.base import GRAVITY
 from sports.rackets import HAND, Game, aims, leaning, racket_pos, served
 from sports.rally import SIDES, Point, Touches, met, play, touches
 from sports.task import Advance, Memory, View, constant, nan_where, place_object, squared
@@ -24,6 +25,8 @@ LONGEST = 3.0
 """Flights of returns are followed for so long (s)."""
 READY_DISTANCE, READY_HEIGHT = 3.0, 0.2
 """m from where an athlete began and of its root below the start's: scales of being ready."""
+APEX_FALL = 2.0
+"""m above the option ``apex`` that divide the pay of a stroke by e."""
 REACHABLE = 4.0
 """A racket further than this (m) from the ball is as good as this far."""
 
@@ -39,6 +42,8 @@ class Stroke:
     """By how much that is more than ever since the last stroke or launch."""
     promising: Tensor
     """bool: its stroke will land in the court beyond the net, and has not yet."""
+    low: Tensor
+    """Factor of the pay for a stroke, by how high it rises; 1 without the option ``apex``."""
     miss: Tensor
     """Squared, from the predicted landing to the target (m^2)."""
     landed: Tensor
@@ -75,6 +80,7 @@ def judge(game: Game, view: View, memory: Memory, sharpness: float) -> Stroke:
         near=near,
         closer=(near - memory["nearest"]).clamp(min=0.0),
         promising=own & coming[:, None],
+        low=lowness(view.config.apex, ball[:, 2], linvel[:, 2])[:, None],
         miss=to_target[..., 0].square() + to_target[..., 1].square(),
         landed=landed & has_struck,
         returns=memory["returns"],
@@ -84,12 +90,15 @@ def judge(game: Game, view: View, memory: Memory, sharpness: float) -> Stroke:
 def shaping(
     game: Game, view: View, memory: Memory, stroke: Stroke, sharpness: float
 ) -> dict[str, Tensor]:
-    """Rewards of the options ``reach``, ``drive`` and ``recover``, where they are asked for."""
+    """Rewards of the options ``reach``, ``drive``, ``aim`` and ``recover``, where they are asked
+    for."""
     config, terms = view.config, {}
     if config.reach > 0.0:
         terms["reach"] = config.reach * nearer(memory, stroke, sharpness)
     if config.drive > 0.0:
         terms["drive"] = config.drive * carried(view, memory, stroke)
+    if config.aim > 0.0:
+        terms["aim"] = config.aim * aimed(stroke, config.aim_width)
     if config.recover > 0.0:
         sides = constant(SIDES, stroke.near.device)[: stroke.near.shape[1]]
         waits = (stroke.point.hitter[:, None] == sides) & (memory["strokes"] > 0)
@@ -119,7 +128,23 @@ def carried(view: View, memory: Memory, stroke: Stroke) -> Tensor:
     share = 1.0 - stroke.miss.sqrt() / torch.hypot(way[..., 0], way[..., 1]).clamp(min=1e-6)
     point, agents = stroke.point, share.shape[1]
     flies = point.struck & ~point.bounced[:, None] & ~point.lost[:, :agents]
-    return share.clamp(min=0.0) * flies
+    return share.clamp(min=0.0) * flies * stroke.low
+
+
+def aimed(stroke: Stroke, width: float) -> Tensor:
+    """(N, A) in the step of a stroke that will land in the far court, exp(-miss / ``width``) of the
+    distance (m) by which it will miss its target; 0 in other steps."""
+    lands = stroke.point.struck & stroke.promising
+    return (-stroke.miss.sqrt() / width).exp() * lands * stroke.low
+
+
+def lowness(apex: float, z: Tensor, linvel_z: Tensor) -> Tensor:
+    """(N,) 1 for balls that do not rise above ``apex`` (m), less for higher ones; 1 for an apex
+    of 0. How high a ball rises is told from its height and vertical speed now, without drag."""
+    if apex == 0.0:
+        return torch.ones_like(z)
+    rise = z + linvel_z.square() / (2.0 * GRAVITY)
+    return (-(rise - apex).clamp(min=0.0) / APEX_FALL).exp()
 
 
 def nearer(memory: Memory, stroke: Stroke, sharpness: float) -> Tensor:

@@ -148,7 +148,7 @@ def advance(view: View, memory: Memory) -> Advance:
     worth = 1.0 + (-now.miss).exp() + now.returns
     terms = {
         "approach": now.near if view.config.shadow else now.closer,
-        "landing": worth * now.promising,
+        "landing": worth * now.promising * now.low,
     }
     terms |= stroke.shaping(rules, view, memory, now, SHARPNESS)
     return stroke.conclude(rules, view, memory, now, terms)

@@ -165,7 +165,7 @@ def advance(view: View, memory: Memory) -> Advance:
     now = stroke.judge(rules, view, memory, SHARPNESS)
     terms = {
         "approach": now.near if view.config.shadow else now.closer,
-        "landing": (1.0 + (-now.miss).exp()) * now.promising,
+        "landing": (1.0 + (-now.miss).exp()) * now.promising * now.low,
         "bounce": now.landed.float(),
     }
     terms |= stroke.shaping(rules, view, memory, now, SHARPNESS)

@@ -103,6 +103,46 @@ def test_a_stroke_is_paid_by_how_far_it_will_carry():
     assert "drive" not in stroke(rally()).terms
 
 
+def test_a_stroke_is_paid_once_by_how_near_to_its_target_it_will_land():
+    """A factor of e less for every ``aim_width``; nothing for strokes out or into the net."""
+    target = torch.tensor((-8.0, 3.0, 0.0))
+
+    def paid(linvel, **options) -> float:
+        world = rally(aim=3.0, **options)
+        world.env.memory["target"][:] = target
+        first = float(stroke(world, linvel).terms["aim"][0, 0])
+        assert world.go((9.0, 1.0, 1.4), linvel).terms["aim"][0, 0] == 0.0
+        return first
+
+    miss = math.hypot(1.0, 0.5)
+    linvel = aimed(-9.0, 2.5)
+    assert paid(linvel) == pytest.approx(3.0 * math.exp(-miss / 0.2), abs=0.002)
+    assert paid(linvel, aim_width=2.0) == pytest.approx(3.0 * math.exp(-miss / 2.0), abs=0.01)
+    assert paid((-20.0, 0.0, 12.0)) == 0.0 and paid((-20.0, 0.0, 0.0)) == 0.0
+    assert "aim" not in stroke(rally()).terms
+    for bad in ({"aim": -1.0}, {"aim_width": 0.0}):
+        with pytest.raises(ValueError, match="aim"):
+            make_env("tennis", num_worlds=1, options=bad)
+
+
+def test_a_stroke_that_rises_above_the_apex_is_paid_less():
+    """By the height to which its vertical speed would carry it without air: v^2 / 2g above the
+    ball. The lower of two strokes is paid in full, and what the ball does is not changed."""
+    linvel = (-12.0, 0.0, 9.0)
+    rise = 1.2 + 9.0**2 / (2 * 9.81)
+    pay = {"drive": 2.0, "aim": 2.0, "aim_width": 5.0}
+    plain, low = (stroke(rally(**pay, apex=apex), linvel) for apex in (0.0, 3.0))
+    factor = math.exp(-(rise - 3.0) / 2.0)
+    for term in ("landing", "drive", "aim"):
+        assert plain.terms[term][0, 0] > 0.1
+        assert low.terms[term][0, 0] == pytest.approx(factor * float(plain.terms[term][0, 0]))
+    high = stroke(rally(**pay, apex=rise + 0.01), linvel)
+    assert all(torch.equal(high.terms[name], term) for name, term in plain.terms.items())
+    assert not low.terminated.any()
+    with pytest.raises(ValueError, match="apex"):
+        make_env("tennis", num_worlds=1, options={"apex": -1.0})
+
+
 def test_who_has_played_is_paid_for_standing_ready():
     """1 for the start itself, from the step after a stroke until the next ball is on its way."""
     world = rally(recover=2.0)
