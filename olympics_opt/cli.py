@@ -90,6 +90,9 @@ class Export:
     """Keep the critic too, so that fine-tuning (``train --init``) need not begin without one."""
     precision: Literal["float16", "int8"] = "float16"
     """Of the weights. int8 takes half the room; evaluate what you export with it."""
+    fit: bool = True
+    """Round to int8 so that the actions change least where the policy comes in episodes of its
+    task, which are played for it (seconds to a minute), instead of each weight by itself."""
     looks: str = ""
     """What its motion looks like, in words, for the card."""
     result: Path | None = None

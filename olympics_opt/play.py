@@ -264,6 +264,7 @@ def run_train(args: list[str]) -> int:
 def run_export(config: Export) -> int:
     """The command. Raises ValueError for a run or a result that cannot be used, OSError where the
     file cannot be written."""
+    from rl.calibration import observed
     from rl.policy import export_policy
 
     if not Path(str(config.run).partition("@")[0]).exists():
@@ -284,6 +285,7 @@ def run_export(config: Export) -> int:
         looks=config.looks,
         critic=config.critic,
         precision=config.precision,
+        observed=observed if config.fit else None,
     )
     print(f"wrote {path} ({path.stat().st_size / 2**20:.1f} MiB) and {path.with_suffix('.json')}")
     return 0

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -23,7 +24,7 @@ from torch import Tensor
 from rl import pretrained
 from rl.card import card_text
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
-from rl.int8 import packed, unpacked
+from rl.int8 import fitted, packed, unpacked
 from rl.latent_action import LatentActions, LatentConfig
 from rl.networks import MLP
 from rl.policy_stack import unstacked
@@ -95,9 +96,13 @@ class Policy:
             if self._random is None or self._random.device != obs.device:
                 self._random = torch.Generator(obs.device).manual_seed(self._noise_seed)
             return 2.0 * torch.rand(shape, device=obs.device, generator=self._random) - 1.0
-        clip = self.metadata["observation_clip"]
-        action = self.actor(((torch.nan_to_num(obs) - self.mean) / self.std).clamp(-clip, clip))
+        action = self.actor(self.inputs(obs))
         return action if self.layer is None else self.layer(obs, action)
+
+    def inputs(self, obs: Tensor) -> Tensor:
+        """(..., obs) raw observations as the network gets them."""
+        clip = self.metadata["observation_clip"]
+        return ((torch.nan_to_num(obs) - self.mean) / self.std).clamp(-clip, clip)
 
     def to(self, device: torch.device | str) -> Policy:
         """The same policy on a device (moved in place)."""
@@ -382,6 +387,7 @@ def export_policy(
     looks: str = "",
     critic: bool = False,
     precision: Literal["float16", "int8"] = "float16",
+    observed: Callable[[Policy], Tensor] | None = None,
 ) -> Path:
     """Writes an actor as ``OUT.safetensors`` and ``OUT.json``; returns the former.
 
@@ -395,6 +401,8 @@ def export_policy(
         looks: what the motion looks like, in words.
         critic: keep the critic too, so that fine-tuning need not begin without one.
         precision: of the weights; int8 takes half the room, matrices row by row (``rl/int8.py``).
+        observed: gives observations (..., obs) of the policy; int8 weights are rounded so that its
+            actions there change least, instead of each by itself.
 
     Raises PolicyError when there is no readable checkpoint or policy, when its weights do not fit
     fp16, and for metrics of another policy.
@@ -405,8 +413,11 @@ def export_policy(
     weights = dict(policy.actor.state_dict())
     if critic:
         weights |= policy.extra
+    rounded: dict[str, Tensor] = {}
+    if precision == "int8" and observed is not None:
+        rounded = fitted(policy.actor, policy.inputs(observed(policy)).flatten(0, -2))
     try:
-        data = packed_weights(weights, precision)
+        data = packed_weights(weights, precision, rounded)
     except ValueError as error:
         raise PolicyError(f"the weights of run '{run}' {error}") from None
     digest = hashlib.sha256(data).hexdigest()
@@ -424,16 +435,19 @@ def export_policy(
 
 
 def packed_weights(
-    weights: dict[str, Tensor], precision: Literal["float16", "int8"] = "float16"
+    weights: dict[str, Tensor],
+    precision: Literal["float16", "int8"] = "float16",
+    rounded: Mapping[str, Tensor] | None = None,
 ) -> bytes:
-    """The content of a policy's weight file. Raises ValueError where they do not fit fp16."""
+    """The content of a policy's weight file; ``rounded``: int8 weights and what belongs to them
+    that are there already. Raises ValueError where they do not fit fp16."""
     halves = {  # running moments stay in float64
         k: v.contiguous() if k.startswith("value_norm.") else v.half().contiguous()
         for k, v in weights.items()
     }
     if not all(torch.isfinite(v).all() for v in halves.values()):
         raise ValueError("do not fit fp16")
-    return save(packed(halves) if precision == "int8" else halves)
+    return save(packed(halves) | dict(rounded or {}) if precision == "int8" else halves)
 
 
 def write_policy(data: bytes, card: dict[str, Any], out: Path | str) -> Path:

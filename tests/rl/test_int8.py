@@ -9,8 +9,10 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from rl.int8 import packed, unpacked
-from rl.policy import PolicyError, export_policy, load_policy
+from rl import calibration
+from rl.int8 import fitted, packed, unpacked
+from rl.networks import MLP
+from rl.policy import PolicyError, export_policy, load_policy, packed_weights, write_policy
 from rl.train import train
 from tests.rl.toy import toy_config, toy_env
 
@@ -39,6 +41,96 @@ def test_no_weight_is_off_by_more_than_half_a_level_of_its_row():
     assert torch.equal(back["zero.weight"], weights["zero.weight"])
     again = packed(back)  # what has been rounded stays
     assert torch.equal(again["a.weight"], small["a.weight"])
+
+
+def mixed(rows: int, inputs: int, seed: int) -> torch.Tensor:
+    """Inputs that go together and have means, like those of an athlete."""
+    generator = torch.Generator().manual_seed(3)
+    mixing = torch.randn(max(2, inputs // 10), inputs, generator=generator)
+    offset = torch.randn(inputs, generator=generator)
+    generator.manual_seed(seed)
+    noise = torch.randn(rows, inputs, generator=generator)
+    return (
+        torch.randn(rows, max(2, inputs // 10), generator=generator) @ mixing
+        + offset
+        + 0.05 * noise
+    )
+
+
+def rounded(actor: MLP, weights: dict[str, torch.Tensor]) -> MLP:
+    """The same actor with what int8 weights stand for."""
+    other = MLP(actor.trunk[0].in_features, (24, 18), 5)
+    other.load_state_dict({k: v.float() for k, v in unpacked(weights).items()})
+    return other
+
+
+def test_weights_fitted_to_inputs_keep_the_outputs_and_their_means():
+    """For inputs like those that they were fitted to, nearer by half than weights that were
+    rounded each by itself; in a file of the same size."""
+    torch.manual_seed(1)
+    actor = MLP(30, (24, 18), 5)
+    plain = packed({k: v.half() for k, v in actor.state_dict().items()})
+    close = fitted(actor, mixed(4000, 30, seed=5))
+    assert {k: (v.dtype, v.shape) for k, v in close.items()} == {
+        k: (v.dtype, v.shape) for k, v in plain.items()
+    }
+    x = mixed(4000, 30, seed=6)
+    off = [(rounded(actor, w)(x) - actor(x)).detach() for w in (plain, close)]
+    assert off[1].square().mean().sqrt() < 0.5 * off[0].square().mean().sqrt()
+    assert off[1].mean(0).abs().max() < 0.25 * off[0].mean(0).abs().max()
+    with pytest.raises(ValueError, match="there are none"):
+        fitted(actor, x[:0])
+
+
+def test_a_column_makes_good_what_rounding_did_to_those_before():
+    """Each weight is rounded from where least squares puts it once those before it are rounded:
+    the rest moves by <rest rest>^-1 <rest before> (w - q)."""
+    torch.manual_seed(2)
+    actor = MLP(6, (50,), 3)
+    x = mixed(5000, 6, seed=5)
+    got = fitted(actor, x)["trunk.0.weight"].numpy()
+    weight = actor.trunk[0].weight.detach().double().numpy()
+    scale = np.abs(weight).max(1, keepdims=True) / 127
+    moments = x.double().numpy().T @ x.double().numpy() / len(x)
+    moments += 0.01 * moments.trace() / 6 * np.eye(6)
+    levels = np.zeros_like(weight)
+    for j in range(6):
+        error = weight[:, :j] - levels[:, :j] * scale
+        moved = np.linalg.solve(moments[j:, j:], moments[j:, :j] @ error.T).T
+        best = (weight[:, j] + moved[:, 0]) / scale[:, 0]
+        levels[:, j] = np.clip(np.rint(best), -127, 127)
+    assert (got == levels).mean() > 0.99  # float32 scales, ties
+    assert (levels != np.rint(weight / scale)).mean() > 0.1
+
+
+def test_a_policy_is_rounded_for_what_it_meets_in_its_own_task(tmp_path, monkeypatch):
+    monkeypatch.setattr(calibration, "WORLDS", 8)
+    monkeypatch.setattr(calibration, "STEPS", 40)
+    policy = load_policy("pretrained:ppo-human", "high_jump")
+    assert policy.actor is not None
+    obs = calibration.observed(policy)
+    assert obs.shape == (8 * 40, policy.metadata["obs_size"]) and obs.isfinite().all()
+    assert torch.equal(obs, calibration.observed(policy))
+    source = tmp_path / "half.safetensors"
+    generator = torch.Generator().manual_seed(4)
+    weights = {  # no whole levels any more
+        name: w * (1.0 + 0.01 * torch.randn(w.shape, generator=generator))
+        for name, w in policy.actor.state_dict().items()
+    }
+    write_policy(packed_weights(weights), policy.metadata | {"precision": "float16"}, source)
+    plain = export_policy(source, tmp_path / "plain", precision="int8")
+    close = export_policy(
+        source, tmp_path / "close", precision="int8", observed=calibration.observed
+    )
+    assert close.stat().st_size == plain.stat().st_size
+    monkeypatch.setattr(calibration, "SEED", 5)
+    policy = load_policy(source, "high_jump")
+    met = calibration.observed(policy)[:, None]
+    off = [
+        float((load_policy(path, "high_jump")(met) - policy(met)).square().mean().sqrt())
+        for path in (plain, close)
+    ]
+    assert off[1] < 0.5 * off[0]
 
 
 @pytest.fixture(scope="module")
