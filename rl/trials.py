@@ -114,10 +114,12 @@ def standing_starts(env: Env, noise: float, seed: int) -> Starts:
 
 
 def ranked(task: str, values: Mapping[str, np.ndarray], of: Iterable[int]) -> list[int]:
-    """Trials from worst to best: by the task's main metric, then by return."""
-    main = values[get_task(task).main_metric]
-    rank = np.where(np.isnan(main), -np.inf, main)
-    return sorted(of, key=lambda t: (rank[t], values["return"][t]))
+    """Trials from worst to best: by the task's main metric, then by the error, where the task has
+    one (of golf strokes nearly all are legal), then by return."""
+    reward = values["return"]
+    main, miss = values[get_task(task).main_metric], values.get("error", np.zeros_like(reward))
+    rank, aim = (np.where(np.isnan(x), -np.inf, x) for x in (main, -miss))
+    return sorted(of, key=lambda t: (rank[t], aim[t], reward[t]))
 
 
 class _Episodes:

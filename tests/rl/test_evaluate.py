@@ -13,6 +13,7 @@ from scipy import stats
 
 from rl.evaluate import EvaluationResult, evaluate, interval
 from rl.recording import Recording
+from rl.trials import ranked
 from sports.env import make_env
 from sports.registry import get_task
 
@@ -96,6 +97,19 @@ def test_every_world_counts_as_often_as_another(played):
     """23 trials of 6 worlds: 4 each, the last world's last left out, and both bars in turn."""
     heights = played.trials["bar_height"]
     np.testing.assert_allclose(heights, np.resize([1.0, 1.5], 23))
+
+
+def test_trials_that_come_to_the_same_are_ranked_by_their_error_then_by_return():
+    nan = float("nan")
+    values = {
+        get_task("golf").main_metric: np.array((1.0, 1.0, 0.0, 1.0, nan)),
+        "error": np.array((7.0, 0.5, nan, 0.5, nan)),
+        "return": np.array((9.0, 1.0, 5.0, 2.0, 0.0)),
+    }
+    assert ranked("golf", values, range(5)) == [4, 2, 0, 1, 3]
+    jumps = {"success": np.array((1.0, 0.0, 1.0)), "return": np.array((2.0, 3.0, 1.0))}
+    jumps[get_task("long_jump").main_metric] = jumps["success"]
+    assert ranked("long_jump", jumps, (0, 1, 2)) == [1, 2, 0]
 
 
 def test_trials_differ_but_a_seed_repeats_them(played):
