@@ -10,9 +10,12 @@ from olympics_opt.progress import progress
 from warmstart import atomic
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from olympics_opt.cli import Evaluate, Export, Render, Verify
     from rl.evaluate import EvaluationResult
     from rl.likeness_reference import Reference
+    from rl.policy import Policy
 
 SHOWN = 8
 """Worlds whose first episodes are looked at for likeness."""
@@ -264,7 +267,6 @@ def run_train(args: list[str]) -> int:
 def run_export(config: Export) -> int:
     """The command. Raises ValueError for a run or a result that cannot be used, OSError where the
     file cannot be written."""
-    from rl.calibration import observed
     from rl.policy import export_policy
 
     if not Path(str(config.run).partition("@")[0]).exists():
@@ -285,10 +287,20 @@ def run_export(config: Export) -> int:
         looks=config.looks,
         critic=config.critic,
         precision=config.precision,
-        observed=observed if config.fit else None,
+        observed=_observed if config.fit else None,
     )
     print(f"wrote {path} ({path.stat().st_size / 2**20:.1f} MiB) and {path.with_suffix('.json')}")
     return 0
+
+
+def _observed(policy: Policy) -> Tensor:
+    """What the policy meets in its own task, which takes a while."""
+    from rl.calibration import observed
+
+    print(
+        f"playing {policy.metadata['task']}, to round the weights for what the policy meets there"
+    )
+    return observed(policy)
 
 
 def _measured(path: Path) -> tuple[dict[str, Any], str]:

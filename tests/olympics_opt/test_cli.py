@@ -299,6 +299,23 @@ def test_an_exported_policy_plays_like_its_run(tmp_path: Path, capsys):
     assert "metrics are of another policy" in capsys.readouterr().err
 
 
+def test_an_export_in_int8_plays_its_task_unless_asked_not_to(tmp_path: Path, capsys, monkeypatch):
+    from rl import calibration
+
+    monkeypatch.setattr(calibration, "WORLDS", 2)
+    monkeypatch.setattr(calibration, "STEPS", 5)
+    policy = finer_policy(tmp_path)
+    sizes, contents = set(), set()
+    for name, flags in (("a", ""), ("b", "--no-fit")):
+        out = tmp_path / f"{name}.safetensors"
+        line = f"export {policy} --out {out} --precision int8 {flags}"
+        assert cli.main(line.split()) == 0
+        assert ("playing long_jump" in capsys.readouterr().out) == (flags == "")
+        sizes.add(out.stat().st_size)
+        contents.add(out.read_bytes())
+    assert len(sizes) == 1 and len(contents) == 2
+
+
 def test_evaluate_survives_no_place_to_write(tmp_path: Path, capsys):
     (tmp_path / "file").write_text("in the way")
     out = tmp_path / "file" / "result.json"
