@@ -8,7 +8,6 @@ from torch import Tensor
 from rl.policy import Policy, as_trained
 from rl.trials import Share, opened
 from sports.registry import get_task
-from sports.starts import START_NOISE
 
 WORLDS = 64
 STEPS = 600
@@ -24,19 +23,13 @@ def observed(policy: Policy) -> Tensor:
     evaluation and in the episodes that follow. Raises PolicyError for a policy that does not fit
     its task any more, ValueError for an unknown task."""
     name = str(policy.metadata["task"])
-    athlete = as_trained(policy, name)
     share = Share(
         task=name,
         engine="mujoco",
         trials=WORLDS,
         worlds=WORLDS,
         seed=SEED,
-        strength=athlete.strength,
-        limits=athlete.limits,
-        options=athlete.options,
-        physics_options={},
-        timestep_divisor=1,
-        start_noise=START_NOISE,
+        **as_trained(policy, name)._asdict(),
     )
     steps = min(get_task(name).max_steps, STEPS)
     with opened(policy, share) as env:

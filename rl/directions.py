@@ -132,9 +132,7 @@ def _hidden(policy: Policy, obs: Tensor) -> Tensor:
     """(M, H) the last hidden layer at observations (M, D)."""
     assert policy.actor is not None
     with torch.no_grad():
-        clip = policy.metadata["observation_clip"]
-        seen = ((torch.nan_to_num(obs) - policy.mean) / policy.std).clamp(-clip, clip)
-        return policy.actor.trunk(seen).double()
+        return policy.actor.trunk(policy.inputs(obs)).double()
 
 
 def shifts(

@@ -20,7 +20,6 @@ from rl.trials import Share, opened
 from sports.physics import make_physics
 from sports.physics.base import PhysicsState
 from sports.scene import finer
-from sports.starts import START_NOISE
 
 FINE = 4
 """MuJoCo's time step is the scene's divided by this: Drake's of most scenes."""
@@ -129,19 +128,13 @@ def find_parting(
     """
     if min(worlds, steps) < 1:
         raise ValueError(f"worlds and steps must be positive, not {worlds} and {steps}")
-    strength, limits, options = as_trained(policy, task, strength, limits, options)
     share = Share(
         task=task,
         engine=engine,
         trials=worlds,
         worlds=worlds,
         seed=seed,
-        strength=strength,
-        limits=limits,
-        options=options,
-        physics_options={},
-        timestep_divisor=1,
-        start_noise=START_NOISE,
+        **as_trained(policy, task, strength, limits, options)._asdict(),
     )
     with opened(policy, share) as env:
         scene = finer(env.physics.scene, divisor)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -413,13 +413,15 @@ def export_policy(
     weights = dict(policy.actor.state_dict())
     if critic:
         weights |= policy.extra
-    rounded: dict[str, Tensor] = {}
-    if precision == "int8" and observed is not None:
-        rounded = fitted(policy.actor, policy.inputs(observed(policy)).flatten(0, -2))
     try:
-        data = packed_weights(weights, precision, rounded)
+        kept = _halves(weights)
     except ValueError as error:
         raise PolicyError(f"the weights of run '{run}' {error}") from None
+    if precision == "int8":
+        kept = packed(kept)
+        if observed is not None:
+            kept |= fitted(policy.actor, policy.inputs(observed(policy)).flatten(0, -2))
+    data = save(kept)
     digest = hashlib.sha256(data).hexdigest()
     if metrics_of and metrics_of not in (policy.metadata["sha256"], digest):
         raise PolicyError(
@@ -434,20 +436,20 @@ def export_policy(
     return write_policy(data, card, out)
 
 
-def packed_weights(
-    weights: dict[str, Tensor],
-    precision: Literal["float16", "int8"] = "float16",
-    rounded: Mapping[str, Tensor] | None = None,
-) -> bytes:
-    """The content of a policy's weight file; ``rounded``: int8 weights and what belongs to them
-    that are there already. Raises ValueError where they do not fit fp16."""
+def packed_weights(weights: dict[str, Tensor]) -> bytes:
+    """The content of a policy's weight file in float16. Raises ValueError where they do not fit."""
+    return save(_halves(weights))
+
+
+def _halves(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Weights in float16. Raises ValueError where they do not fit."""
     halves = {  # running moments stay in float64
         k: v.contiguous() if k.startswith("value_norm.") else v.half().contiguous()
         for k, v in weights.items()
     }
     if not all(torch.isfinite(v).all() for v in halves.values()):
         raise ValueError("do not fit fp16")
-    return save(packed(halves) | dict(rounded or {}) if precision == "int8" else halves)
+    return halves
 
 
 def write_policy(data: bytes, card: dict[str, Any], out: Path | str) -> Path:

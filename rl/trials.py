@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from rl.policy import Policy
 from rl.recording import Recording, Tape
 from sports.env import Env, Starts, StepResult, make_env
 from sports.registry import get_task
-from sports.starts import loose_joints
+from sports.starts import START_NOISE, loose_joints
 
 START_FRAMES = 4096
 KEEP_ALL = 64
@@ -40,9 +40,9 @@ class Share:
     strength: str
     limits: str
     options: dict[str, Any]
-    physics_options: dict[str, Any]
-    timestep_divisor: int
-    start_noise: float
+    physics_options: dict[str, Any] = field(default_factory=dict)
+    timestep_divisor: int = 1
+    start_noise: float = START_NOISE
     record: bool = False
     """Keep what may turn out to be the best or the median."""
     worlds_recorded: tuple[int, ...] = ()

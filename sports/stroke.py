@@ -122,7 +122,8 @@ def ready(game: Game, view: View) -> Tensor:
 
 def carried(view: View, memory: Memory, stroke: Stroke) -> Tensor:
     """(N, A) in the step of an athlete's stroke that breaks no rule, the share of the way to its
-    target that the ball will fly; 0 in other steps and for a stroke away from it."""
+    target that the ball will fly, less for a high one (``low``); 0 in other steps and for a stroke
+    away from it."""
     ball = view.physics.object_pos[:, 0, None]
     way = (memory["target"] - ball)[..., :2]
     share = 1.0 - stroke.miss.sqrt() / torch.hypot(way[..., 0], way[..., 1]).clamp(min=1e-6)
@@ -133,7 +134,8 @@ def carried(view: View, memory: Memory, stroke: Stroke) -> Tensor:
 
 def aimed(stroke: Stroke, width: float) -> Tensor:
     """(N, A) in the step of a stroke that will land in the far court, exp(-miss / ``width``) of the
-    distance (m) by which it will miss its target; 0 in other steps."""
+    distance (m) by which it will miss its target, less for a high one (``low``); 0 in other
+    steps."""
     lands = stroke.point.struck & stroke.promising
     return (-stroke.miss.sqrt() / width).exp() * lands * stroke.low
 
