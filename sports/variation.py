@@ -49,6 +49,13 @@ class Variation:
     cone_share: float = 0.0
     """Share of worlds in which friction has a round cone, as in Drake, instead of a pyramid inside
     it, which gives less where a foot slips across its axes. On a GPU all worlds or none."""
+    rebound_share: float = 0.0
+    """Share of worlds in which what touches ``rebound_links`` bounces off, by now less and now more
+    than it came with; in the others, as in MuJoCo's model, it stays. None of them is coarse. Meant
+    for a ``timestep_divisor`` of 4: there duels of the shipped fencers and boxers end as in Drake
+    (docs/physics.md)."""
+    rebound_links: tuple[str, ...] = ("R_Hand",)
+    """Such as a sword's, R_Hand."""
     own_share: float = 0.0
     """Share of worlds that are the task's own, in which nothing is drawn and contacts do not feel
     the damping: for a policy that must also hold there."""
@@ -61,7 +68,7 @@ class Variation:
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
                 raise ValueError(f"variation: {name} must be 0 < low <= high, not {low}, {high}")
-        for name in ("coarse_share", "felt_share", "cone_share", "own_share"):
+        for name in ("coarse_share", "felt_share", "cone_share", "rebound_share", "own_share"):
             share = getattr(self, name)
             if not 0.0 <= share <= 1.0:
                 raise ValueError(f"variation: {name} must be in [0, 1], not {share}")

@@ -21,6 +21,7 @@ adds Coulomb's after each step (``athletes.roll_ball``).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import mujoco
@@ -139,6 +140,22 @@ def firm_ground(model: mujoco.MjModel) -> None:
     model.geom_solref[own], model.geom_solimp[own] = FIRM_SOLREF, FIRM_SOLIMP
 
 
+def let_rebound(model: mujoco.MjModel, scene: Scene, links: Sequence[str]) -> None:
+    """Lets ``links`` of athletes decide how they touch anything but balls, which ``rebound_geoms``
+    then finds. Raises ValueError for a link that the athletes do not have."""
+    for link in links:
+        if link not in scene.body.link_names:
+            raise ValueError(f"variation: rebound_links has '{link}', which is no link of the body")
+        for agent in range(scene.num_agents):
+            body = model.body(body_name(agent, link)).id
+            model.geom_priority[model.geom_bodyid == body] = 1
+
+
+def rebound_geoms(model: mujoco.MjModel) -> np.ndarray:
+    """(geoms,) bool, those that ``let_rebound`` chose."""
+    return yields(model.geom_solref) & (model.geom_priority > 0)
+
+
 def is_bounce(solref: np.ndarray) -> np.ndarray:
     """Which contact references (..., 2) of a compiled model are those of a ball's bounce; their
     damping holds for one time step."""
@@ -155,7 +172,7 @@ def _bounce(ball: SceneObject, timestep: float) -> dict[str, object]:
         # MuJoCo divides these by the impedance, and gives the contact that share of them.
         "solref": (-BOUNCE_STIFFNESS * BOUNCE_IMPEDANCE**2, -damping),
         "solimp": (BOUNCE_IMPEDANCE, BOUNCE_IMPEDANCE, 0.001, 0.5, 2.0),
-        "priority": 1,
+        "priority": 2,
         "condim": 1,
     }
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sports.humanoid.mjcf import build_model, firm_ground
+from sports.humanoid.mjcf import build_model, firm_ground, let_rebound
 from sports.physics.athletes import tree_of
 from sports.physics.base import PhysicsState, default_state
 from sports.physics.results import Results, Shown, show
@@ -45,6 +45,8 @@ class MujocoPhysics:
         self.geometry = CompiledGeometry(scene.body, self.device)
         drawn = None
         if variation is not None:
+            if variation.rebound_share:
+                let_rebound(model, scene, variation.rebound_links)
             drawn = draw(
                 variation, n, scene.substeps, variation_seed, felt_damping, variation_blocks
             )

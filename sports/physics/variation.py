@@ -18,13 +18,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
 from sports.humanoid.body import Body
-from sports.humanoid.mjcf import holds, is_bounce, yields
+from sports.humanoid.mjcf import holds, is_bounce, rebound_geoms, yields
 from sports.scene import Scene
 from sports.variation import FELT, RANGES, Variation
 
+REBOUND_SOLREF, REBOUND_IMPEDANCE = (0.0045, 0.3), 0.99
+"""Time constant (s), damping ratio and impedance of contacts that rebound: with 0.45 of the
+approach at fine time steps; at 1/480 s with 0.2 to 1.8 of it, as the instant of contact falls."""
 LEAST_SUBSTEPS = 4
 """In a control step, of the coarsest worlds: the usual number."""
 
@@ -50,6 +54,8 @@ class Draw:
     """share by which gains on the left are greater and on the right smaller"""
     cone: np.ndarray
     """bool, whether friction has a round cone"""
+    rebound: np.ndarray
+    """bool, whether links that may rebound do"""
 
     def gains(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         """(N, nu) factors of the servos' stiffness and (N, nv) of the damping."""
@@ -111,7 +117,9 @@ def draw(
     stride, felt = np.where(own, variation.own_stride, stride), felt & ~own
     side = np.where(own, 0.0, uniform((-variation.uneven, variation.uneven)))
     cone = (rng.random(num_worlds) < variation.cone_share) & ~own
-    return Draw(**values, stride=stride, felt=felt, own=own, side=side, cone=cone)
+    rebound = (rng.random(num_worlds) < variation.rebound_share) & ~own
+    stride = np.where(rebound, 1, stride)
+    return Draw(**values, stride=stride, felt=felt, own=own, side=side, cone=cone, rebound=rebound)
 
 
 def _sides(body: Body) -> np.ndarray:
@@ -144,13 +152,12 @@ def split_damping(
     return Damping(damping - force, force, timestep[:, None] * force)
 
 
-def contact_softness(
-    solref: np.ndarray, solimp: np.ndarray, drawn: Draw
-) -> tuple[np.ndarray, np.ndarray]:
+def contact_softness(model: mujoco.MjModel, drawn: Draw) -> tuple[np.ndarray, np.ndarray]:
     """(N, geoms, 2) ``solref`` and (N, geoms, 5) ``solimp`` of every world: as drawn for athletes
-    and ground, and for hands and what they hold; else, and in the task's own worlds, the model's
-    (geoms, 2) and (geoms, 5). A ball bounces in one time step, however long that of its world
+    and ground, for links that rebound, and for hands and what they hold; else, and in the task's
+    own worlds, the ``model``'s. A ball bounces in one time step, however long that of its world
     is."""
+    solref, solimp = model.geom_solref, model.geom_solimp
     varied = ~drawn.own[:, None]
     ground = (yields(solref) & varied)[..., None]
     softness = np.stack((drawn.contact_time, drawn.contact_damping), axis=-1)[:, None]
@@ -159,4 +166,7 @@ def contact_softness(
     own = np.repeat(solref[None], len(drawn.stride), axis=0)
     own[..., 1] /= np.where(is_bounce(solref), drawn.stride[:, None], 1)
     own[..., 0] = np.where(holds(solref) & varied, drawn.hold_time[:, None], own[..., 0])
-    return np.where(ground, softness, own), np.where(ground, impedance, solimp[None])
+    solref, solimp = np.where(ground, softness, own), np.where(ground, impedance, solimp[None])
+    rebounds = drawn.rebound[:, None] & rebound_geoms(model)
+    solref[rebounds], solimp[rebounds, :2] = REBOUND_SOLREF, REBOUND_IMPEDANCE
+    return solref, solimp

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from sports.ball_law.compiled import for_gpu
 from sports.humanoid.body import is_finger
-from sports.humanoid.mjcf import body_name, build_model, firm_ground
+from sports.humanoid.mjcf import body_name, build_model, firm_ground, let_rebound
 from sports.physics import warp_kernels as kernels
 from sports.physics.base import Geometry, PhysicsState, diverged
 from sports.physics.game import build_game, has_game
@@ -81,6 +81,8 @@ class WarpPhysics:
             firm_ground(model)
         drawn = None
         if variation is not None:
+            if variation.rebound_share:
+                let_rebound(model, scene, variation.rebound_links)
             drawn = draw(
                 variation,
                 num_worlds,
@@ -293,7 +295,7 @@ class WarpPhysics:
         friction = rows(model.geom_friction)
         friction[:, :, 0] *= drawn.friction[:, None]
         m.geom_friction = wp.array(friction, dtype=wp.vec3)
-        solref, solimp = contact_softness(model.geom_solref, model.geom_solimp, drawn)
+        solref, solimp = contact_softness(model, drawn)
         m.geom_solref = wp.array(solref.astype(np.float32), dtype=m.geom_solref.dtype)
         m.geom_solimp = wp.array(solimp.astype(np.float32), dtype=m.geom_solimp.dtype)
         gain, bias = rows(model.actuator_gainprm), rows(model.actuator_biasprm)

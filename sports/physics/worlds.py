@@ -96,10 +96,9 @@ class Worlds:
         self._balls = [_Ball(model, ball, n) for ball in scene.bouncing]
         self._timesteps: list[np.ndarray] | None = None
         self._even = np.full(n, scene.timestep)
-        self._softness = model.geom_solref, model.geom_solimp
         felt, longest = np.full(n, felt_damping), self._even
         if drawn is not None:
-            self._vary(drawn)
+            self._vary(model, drawn)
             felt, longest = drawn.felt, drawn.stride * scene.timestep
         self._felt: np.ndarray | None = None
         if felt.any():
@@ -203,13 +202,13 @@ class Worlds:
             return game
         return game._replace(phases=out.wave_phase, **shown)
 
-    def _vary(self, drawn: Draw) -> None:
+    def _vary(self, model: mujoco.MjModel, drawn: Draw) -> None:
         """Gives each world its own numbers; see the ``warp`` engine."""
         expand = self.batch.expand
         expand("geom_friction")[:, :, 0] *= drawn.friction[:, None]
         for ball in self._balls:
             ball.friction *= drawn.friction
-        softness = contact_softness(*self._softness, drawn)
+        softness = contact_softness(model, drawn)
         expand("geom_solref")[:], expand("geom_solimp")[:] = softness
         stiffness, dampings = drawn.gains(self.scene)
         expand("actuator_gainprm")[:, :, 0] *= stiffness

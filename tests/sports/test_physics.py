@@ -11,9 +11,9 @@ import sports.physics.mujoco as engine
 from sports.env import make_env, make_scene
 from sports.frames import Heading, proprioception
 from sports.humanoid import load_body
-from sports.humanoid.mjcf import build_model
+from sports.humanoid.mjcf import build_model, let_rebound
 from sports.physics import Geometry, PhysicsState, default_state, make_physics
-from sports.physics.variation import Variation, draw
+from sports.physics.variation import REBOUND_SOLREF, Variation, contact_softness, draw
 from sports.scene import Start, humanoid_scene
 from warmstart.clip import Clip
 
@@ -587,3 +587,72 @@ def test_wrong_use_is_one_sentence():
         pytest.importorskip("mujoco_warp")
         with pytest.raises(RuntimeError, match="found no GPU"):
             make_env("long_jump", engine="warp", num_worlds=2)
+
+
+def test_what_links_touch_rebounds_in_a_share_of_the_worlds_that_vary():
+    """Only there, only those links, as the mixing of MuJoCo has it; balls keep their own law."""
+    scene, n = make_scene("boxing", timestep_divisor=4), 32
+    usual = Variation(own_share=0.3, own_stride=4)
+    gloves = dataclasses.replace(usual, rebound_share=0.5, rebound_links=("L_Hand", "R_Hand"))
+    drawn, before = (draw(v, n, scene.substeps, 5) for v in (gloves, usual))
+    assert 4 <= drawn.rebound.sum() < n and not (drawn.rebound & drawn.own).any()
+    assert (drawn.stride[drawn.rebound] == 1).all()
+    model, plain = build_model(scene), build_model(scene)
+    let_rebound(model, scene, gloves.rebound_links)
+    solref, solimp = contact_softness(model, drawn)
+    hands = [model.body(f"agent{a}/{h}").id for a in (0, 1) for h in gloves.rebound_links]
+    glove = np.isin(model.geom_bodyid, hands)
+    assert glove.sum() == 4
+    bounces = drawn.rebound[:, None] & glove
+    assert np.allclose(solref[bounces], REBOUND_SOLREF)
+    for got, expected in zip((solref, solimp), contact_softness(plain, before)):
+        assert np.array_equal(got[~bounces], expected[~bounces])
+    # A glove that lies in the other's chest: the contact has the glove's numbers, not a mean.
+    world = int(np.flatnonzero(drawn.rebound)[0])
+    model.geom_solref[:] = solref[world]
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    gap = data.body("agent1/Chest").xpos - data.body("agent0/L_Hand").xpos
+    data.qpos[:3] += gap - (0.1, 0.0, 0.0)
+    mujoco.mj_forward(model, data)
+    touching = [c for c in data.contact if glove[c.geom].sum() == 1]
+    assert touching and all(np.allclose(c.solref, REBOUND_SOLREF) for c in touching)
+
+    football = make_scene("penalty_kick")
+    model = build_model(football)
+    let_rebound(model, football, ("R_Toe",))
+    fine = dataclasses.replace(gloves, coarse_share=0.0, own_stride=1)
+    own = contact_softness(model, draw(fine, 4, football.substeps, 1))[0]
+    ball = model.geom_bodyid == model.body("ball").id
+    assert (own[:, ball] == build_model(football).geom_solref[ball]).all() and ball.any()
+    assert (model.geom_priority[ball] > model.geom_priority[~ball].max()).all()
+    with pytest.raises(ValueError, match="rebound_links has 'Sword', which is no link"):
+        cpu(scene, 2, variation=Variation(rebound_share=1.0, rebound_links=("Sword",)))
+    with pytest.raises(ValueError, match="rebound_share must be in"):
+        Variation(rebound_share=1.5)
+
+
+def test_links_rebound_alike_on_both_engines():
+    """A fencer runs the blade into the other's chest: other motion than in worlds that do not."""
+    pytest.importorskip("mujoco_warp")
+    scene = make_scene("fencing", timestep_divisor=4)
+    one = (1.0, 1.0)
+    plain = Variation(one, one, one, coarse_share=0.0, felt_share=0.0)
+    rebound = dataclasses.replace(plain, rebound_share=1.0)
+    worlds = [
+        cpu(scene, 2, variation=plain),
+        cpu(scene, 2, variation=rebound),
+        make_physics("warp", scene, 2, device="cpu", variation=rebound),
+    ]
+    state = default_state(scene, 2, "cpu")
+    state.qpos[:, :2] += torch.tensor([1.3, 0.16])
+    state.qvel[:, 0] = 2.0
+    for physics in worlds:
+        physics.reset(torch.ones(2, dtype=torch.bool), state)
+    rest = torch.tensor(scene.action_offset(), dtype=torch.float32).repeat(2, 2)
+    for _ in range(6):
+        for physics in worlds:
+            physics.step(rest)
+    stays, leaves, on_gpu = (physics.qpos for physics in worlds)
+    assert (leaves - on_gpu).abs().max() < 2e-3
+    assert (leaves - stays).abs().max() > 2e-2
