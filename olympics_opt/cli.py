@@ -16,7 +16,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,6 +24,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from rl.polish_config import Polish
+from sports.variation import Variation
 
 Name = Annotated[str, arg(metavar="NAME")]
 
@@ -126,7 +127,14 @@ class Evaluate:
     """Joint ranges; by default those the policy was trained with."""
     felt_damping: bool = False
     """In ``mujoco`` and ``warp``, let contacts feel the joints' damping, as Drake's do: a quick
-    guess of what Drake will say. The result says so, and does not compare with the others."""
+    guess of what Drake will say. Like the next three options: the result says so, and does not
+    compare with the others."""
+    timestep_divisor: int = 1
+    """2 halves the physics time step of ``mujoco`` and ``warp`` at the same control rate."""
+    vary: bool = False
+    """In ``mujoco`` and ``warp``, play in worlds that differ, as in training."""
+    variation: Variation = field(default_factory=Variation)
+    """How they do, and how widely."""
     likeness: Path | None = None
     """Print how human the motion looks beside the score: ``reference`` compares it with the shipped
     figures of people, a clip library with its held-out clips (``olympics-opt likeness``)."""

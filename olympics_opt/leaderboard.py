@@ -18,6 +18,8 @@ from warmstart import atomic
 
 BEGIN, END = "<!-- results -->", "<!-- /results -->"
 REQUIRED = ("task", "algo", "engine", "strength", "trials", "seed", "commit", "metrics")
+OTHER_PHYSICS = {"felt_damping", "timestep_divisor", "variation"}
+"""Fields of results that were played in physics other than the task's own."""
 PAPER_COLUMNS = ("PPO", "AMP", "PULSE", "PULSE + AMP")
 PAPER_METHOD = {"amp": "AMP", "latent": "PULSE", "latent-amp": "PULSE + AMP"}
 """The paper's method beside which an algorithm of ours stands; PPO for the others."""
@@ -26,9 +28,8 @@ PAPER_METHOD = {"amp": "AMP", "latent": "PULSE", "latent-amp": "PULSE + AMP"}
 def read_results(folder: str | Path) -> list[dict[str, Any]]:
     """Every result in a folder, sorted by task, strength, algorithm and engine.
 
-    Files of other kinds (a benchmark) and results with felt damping, which is other physics, are
-    left out. Raises ValueError naming a file that is not
-    JSON, or a result that lacks a field.
+    Files of other kinds (a benchmark) and results of other physics than the task's own are left
+    out. Raises ValueError naming a file that is not JSON, or a result that lacks a field.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -41,7 +42,7 @@ def read_results(folder: str | Path) -> list[dict[str, Any]]:
             raise ValueError(f"{path} is not a readable result file: {error}") from error
         if not isinstance(result, dict) or "task" not in result or "metrics" not in result:
             continue
-        if result.get("felt_damping"):
+        if result.keys() & OTHER_PHYSICS:
             continue
         missing = [name for name in REQUIRED if name not in result]
         if missing:

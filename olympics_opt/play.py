@@ -96,7 +96,7 @@ def play(
     record: bool = False,
     record_worlds: tuple[int, ...] = (),
     label: str = "",
-    felt_damping: bool = False,
+    physics_options: dict[str, Any] | None = None,
 ) -> EvaluationResult:
     """``rl.evaluate.evaluate`` with a line of progress; its errors and its result.
 
@@ -117,7 +117,7 @@ def play(
             limits=limits,
             options=options,
             timestep_divisor=timestep_divisor,
-            physics_options={"felt_damping": True} if felt_damping else None,
+            physics_options=physics_options,
             record=int(record),
             record_worlds=record_worlds,
             processes=processes,
@@ -134,10 +134,19 @@ def play(
 def run_evaluate(config: Evaluate) -> int:
     """The command: prints the metrics and writes the result schema."""
     trials = asked(config)
-    if config.felt_damping and config.engine == "drake":
-        raise ValueError(
-            "contacts always feel the joints' damping in drake: leave out felt-damping"
-        )
+    from rl.worlds import engine_options, mistakes
+
+    if config.engine == "drake":
+        if config.felt_damping:
+            raise ValueError(
+                "contacts always feel the joints' damping in drake: leave out felt-damping"
+            )
+        if config.vary or config.timestep_divisor != 1:
+            raise ValueError(
+                "drake has worlds and steps of its own: leave --vary and the divisor out"
+            )
+    for mistake in mistakes(config):
+        raise ValueError(mistake)
     if config.trials >= 1:  # else the evaluation says what is wrong
         atomic.prepare(config.out)
     reference = None
@@ -151,7 +160,8 @@ def run_evaluate(config: Evaluate) -> int:
         engine=config.engine,
         worlds=config.worlds,
         record_worlds=worlds,
-        felt_damping=config.felt_damping,
+        timestep_divisor=config.timestep_divisor,
+        physics_options=engine_options(config, config.seed),
     )
     print_metrics(played.result)
     print_training_step(config)

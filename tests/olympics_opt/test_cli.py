@@ -226,6 +226,33 @@ def test_felt_damping_is_played_and_told(tmp_path: Path, capsys):
     assert not out.exists()
 
 
+def test_worlds_that_vary_are_played_and_told(tmp_path: Path, capsys):
+    """Four times as fine, with what swords touch rebounding: other bouts; mistakes are told."""
+    line = "evaluate fencing --policy zero --trials 2 --seed 3"
+    finer = "--timestep-divisor 4"
+    varied = f"{finer} --vary --variation.rebound-share 1 --variation.friction 1 1"
+    results = []
+    for name, options in (("plain", ""), ("finer", finer), ("varied", varied), ("again", varied)):
+        out = tmp_path / f"{name}.json"
+        assert cli.main(f"{line} {options} --out {out}".split()) == 0
+        results.append(json.loads(out.read_text()))
+    plain, fine, other, again = results
+    assert "timestep_divisor" not in plain and "variation" not in fine
+    assert fine["timestep_divisor"] == 4 and fine["substeps"] == 4 * plain["substeps"]
+    assert other["variation"]["rebound_share"] == 1.0 and other["variation"]["own_stride"] == 4
+    assert other["metrics"] == again["metrics"]
+    out = tmp_path / "wrong.json"
+    for wrong, told in (
+        ("--engine drake --vary", "drake has worlds and steps of its own"),
+        ("--engine drake --timestep-divisor 2", "drake has worlds and steps of its own"),
+        ("--variation.rebound-share 1", "give --vary as well"),
+        ("--timestep-divisor 0", "must be at least 1"),
+        ("--vary --variation.rebound-share 1 --variation.rebound-links Sword", "no link"),
+    ):
+        assert told in sentence_of(capsys, *f"{line} {wrong} --out {out}".split())
+        assert not out.exists()
+
+
 def finer_policy(folder: Path, **settings: object) -> Path:
     """A small policy of the long jump whose card says at which time step it was trained."""
     from rl.policy import export_policy

@@ -81,9 +81,12 @@ def test_a_front_page_without_marks_changes_nothing(folder: Path):
     assert front.read_text() == "# Title\n" and not (folder / "README.md").exists()
 
 
-def test_felt_damping_is_other_physics(folder: Path):
+@pytest.mark.parametrize(
+    "other", [{"felt_damping": True}, {"timestep_divisor": 4}, {"variation": {"own_share": 0.0}}]
+)
+def test_other_physics_is_left_out(folder: Path, other: dict[str, object]):
     before = leaderboard.read_results(folder)
-    (folder / "felt.json").write_text(json.dumps(result(felt_damping=True)))
+    (folder / "other.json").write_text(json.dumps(result(**other)))
     assert leaderboard.read_results(folder) == before
 
 
