@@ -49,6 +49,11 @@ class Variation:
     cone_share: float = 0.0
     """Share of worlds in which friction has a round cone, as in Drake, instead of a pyramid inside
     it, which gives less where a foot slips across its axes. On a GPU all worlds or none."""
+    impratio: tuple[float, float] = (1.0, 1.0)
+    """How many times stiffer friction is than the normal force (MuJoCo's ``impratio``), drawn
+    log-uniformly. At 1, as in the model, feet that are loaded sideways creep, so that heel and
+    toes and the two feet hardly push against each other; at 30 with a round cone they do as in
+    Drake (docs/physics.md)."""
     rebound_share: float = 0.0
     """Share of worlds in which what touches ``rebound_links`` bounces off, by now less and now more
     than it came with; in the others, as in MuJoCo's model, it stays. None of them is coarse. Meant
@@ -64,7 +69,7 @@ class Variation:
     time step."""
 
     def __post_init__(self) -> None:
-        for name in (*RANGES, *(f"felt_{name}" for name in FELT), "hold_time"):
+        for name in (*RANGES, *(f"felt_{name}" for name in FELT), "hold_time", "impratio"):
             low, high = getattr(self, name)
             if not 0.0 < low <= high:
                 raise ValueError(f"variation: {name} must be 0 < low <= high, not {low}, {high}")

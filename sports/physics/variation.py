@@ -56,6 +56,8 @@ class Draw:
     """bool, whether friction has a round cone"""
     rebound: np.ndarray
     """bool, whether links that may rebound do"""
+    impratio: np.ndarray
+    """stiffness of friction by that of the normal force"""
 
     def gains(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         """(N, nu) factors of the servos' stiffness and (N, nv) of the damping."""
@@ -119,7 +121,10 @@ def draw(
     cone = (rng.random(num_worlds) < variation.cone_share) & ~own
     rebound = (rng.random(num_worlds) < variation.rebound_share) & ~own
     stride = np.where(rebound, 1, stride)
-    return Draw(**values, stride=stride, felt=felt, own=own, side=side, cone=cone, rebound=rebound)
+    low, high = np.log(variation.impratio)
+    impratio = np.where(own, 1.0, np.exp(rng.uniform(low, high, size=num_worlds)))
+    drawn = {"stride": stride, "felt": felt, "own": own, "side": side, "cone": cone}
+    return Draw(**values, **drawn, rebound=rebound, impratio=impratio)
 
 
 def _sides(body: Body) -> np.ndarray:

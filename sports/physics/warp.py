@@ -306,6 +306,7 @@ class WarpPhysics:
         m.actuator_biasprm = wp.array(bias, dtype=m.actuator_biasprm.dtype)
         damping = rows(model.dof_damping.reshape(model.nv, -1)[:, 0])
         m.dof_damping = wp.array(damping * dampings.astype(np.float32), dtype=float)
+        m.opt.impratio_invsqrt = wp.array(drawn.impratio.astype(np.float32) ** -0.5, dtype=float)
         timesteps = drawn.timesteps(self.scene.timestep, self.scene.substeps)
         if timesteps is not None:
             self._timesteps = [wp.array(h.astype(np.float32), dtype=float) for h in timesteps]

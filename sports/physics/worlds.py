@@ -217,6 +217,8 @@ class Worlds:
         damping *= dampings[..., None]
         if drawn.cone.any():
             expand("opt.cone")[drawn.cone] = int(mujoco.mjtCone.mjCONE_ELLIPTIC)
+        if (drawn.impratio != 1.0).any():
+            expand("opt.impratio")[:] = drawn.impratio
         self._timesteps = drawn.timesteps(self.scene.timestep, self.scene.substeps)
         if self._timesteps is not None:
             self._timestep = expand("opt.timestep")

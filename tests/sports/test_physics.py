@@ -656,3 +656,47 @@ def test_links_rebound_alike_on_both_engines():
     stays, leaves, on_gpu = (physics.qpos for physics in worlds)
     assert (leaves - on_gpu).abs().max() < 2e-3
     assert (leaves - stays).abs().max() > 2e-2
+
+
+def test_feet_that_are_pushed_apart_creep_less_where_friction_is_stiffer():
+    """Legs that press outwards move standing feet apart, with stiff friction hardly, alike on both
+    engines; a share of the worlds is the task's own, and draws span the range."""
+    pytest.importorskip("mujoco_warp")
+    scene, n = make_scene("long_jump"), 2
+    one = (1.0, 1.0)
+    soft = Variation(one, one, one, coarse_share=0.0, felt_share=0.0, cone_share=1.0)
+    stiff = dataclasses.replace(soft, impratio=(30.0, 30.0))
+    worlds = [
+        cpu(scene, n, variation=soft),
+        cpu(scene, n, variation=stiff),
+        make_physics("warp", scene, n, device="cpu", variation=stiff),
+    ]
+    feet = [scene.body.link_index(f"{side}_Ankle") for side in "LR"]
+    apart = torch.tensor(scene.action_offset(), dtype=torch.float32).repeat(n, 1)
+    for name, sign in (("L_Hip_x", 1.0), ("R_Hip_x", -1.0)):
+        apart[:, [dof.name for dof in scene.body.dofs].index(name)] += 0.1 * sign
+    crept = []
+    for physics in worlds:
+        distance = []
+        for _ in range(30):
+            physics.step(apart)
+            distance.append(float(physics.body_pos[0, 0, feet].diff(dim=0).norm()))
+        crept.append(distance[-1] - distance[11])  # they stand by then
+    yields, sticks, on_gpu = crept
+    print(f"feet creep {yields:.4f} m, with an impratio of 30 {sticks:.4f} m")
+    assert yields > 0.005 and sticks < 0.1 * yields
+    assert sticks == pytest.approx(on_gpu, abs=5e-4)
+
+    drawn = draw(Variation(impratio=(1.0, 30.0), own_share=0.3), 400, scene.substeps, 3)
+    usual = draw(Variation(own_share=0.3), 400, scene.substeps, 3)
+    assert (drawn.impratio[drawn.own] == 1.0).all() and (usual.impratio == 1.0).all()
+    others = drawn.impratio[~drawn.own]
+    assert others.min() >= 1.0 and others.max() <= 30.0
+    assert np.median(others) == pytest.approx(np.sqrt(30.0), rel=0.2)
+    assert all(
+        np.array_equal(getattr(drawn, name), value)
+        for name, value in vars(usual).items()
+        if name != "impratio"
+    )
+    with pytest.raises(ValueError, match="impratio must be 0 < low <= high"):
+        Variation(impratio=(0.0, 1.0))
