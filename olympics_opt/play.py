@@ -133,9 +133,9 @@ def play(
 
 def run_evaluate(config: Evaluate) -> int:
     """The command: prints the metrics and writes the result schema."""
-    trials = asked(config)
     from rl.worlds import engine_options, mistakes
 
+    trials = asked(config)
     if config.engine == "drake":
         if config.felt_damping:
             raise ValueError(

@@ -57,10 +57,10 @@ class Variation:
     rebound_share: float = 0.0
     """Share of worlds in which what touches ``rebound_links`` bounces off, by now less and now more
     than it came with; in the others, as in MuJoCo's model, it stays. None of them is coarse. Meant
-    for a ``timestep_divisor`` of 4: there duels of the shipped fencers and boxers end as in Drake
+    for a ``timestep_divisor`` of 4, where duels of policies that had not met it ended as in Drake
     (docs/physics.md)."""
     rebound_links: tuple[str, ...] = ("R_Hand",)
-    """Such as a sword's, R_Hand."""
+    """Links of athletes; a sword is ``R_Hand``, boxing gloves are ``L_Hand`` and ``R_Hand``."""
     own_share: float = 0.0
     """Share of worlds that are the task's own, in which nothing is drawn and contacts do not feel
     the damping: for a policy that must also hold there."""

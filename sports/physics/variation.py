@@ -123,8 +123,16 @@ def draw(
     stride = np.where(rebound, 1, stride)
     low, high = np.log(variation.impratio)
     impratio = np.where(own, 1.0, np.exp(rng.uniform(low, high, size=num_worlds)))
-    drawn = {"stride": stride, "felt": felt, "own": own, "side": side, "cone": cone}
-    return Draw(**values, **drawn, rebound=rebound, impratio=impratio)
+    return Draw(
+        **values,
+        stride=stride,
+        felt=felt,
+        own=own,
+        side=side,
+        cone=cone,
+        rebound=rebound,
+        impratio=impratio,
+    )
 
 
 def _sides(body: Body) -> np.ndarray:
