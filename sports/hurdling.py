@@ -469,8 +469,9 @@ def advance(view: View, memory: Memory) -> Advance:
 
 
 def hurdles_behind(x: Tensor) -> Tensor:
-    """How many of the hurdles' planes lie at or behind x (m), 0 to 10, as a float."""
-    return ((x + (GAP - FIRST_X)) / GAP).floor_().clamp_(0.0, HURDLES)
+    """How many of the hurdles' planes lie at or behind x (m), 0 to 10, as a float; 0 for NaN, of a
+    world that diverged."""
+    return ((x + (GAP - FIRST_X)) / GAP).floor_().nan_to_num_(0.0).clamp_(0.0, HURDLES)
 
 
 def leap(view: View, memory: Memory) -> Tensor:

@@ -50,6 +50,31 @@ def test_two_hundred_random_steps_are_finite(task):
 
 
 @pytest.mark.parametrize("task", task_names())
+def test_a_world_that_diverges_is_lost_alone(task, monkeypatch):
+    """On a GPU its NaN reach the task: nothing may be looked up by them."""
+    env, clean = (make_env(task, num_worlds=4, seed=1, training=False) for _ in range(2))
+    for action in actions(env, 3):
+        env.step(action), clean.step(action)
+
+    def step(ctrl, physics=env.physics, honest=env.physics.step):
+        honest(ctrl)
+        physics.bad[2] = True
+        for value in vars(physics).values():
+            if isinstance(value, torch.Tensor) and value.is_floating_point() and len(value) == 4:
+                value[2] = torch.nan
+
+    monkeypatch.setattr(env.physics, "step", step)
+    action = actions(env, 1)[0]
+    result, reference = env.step(action), clean.step(action)
+    assert result.valid.tolist() == [True, True, False, True]
+    assert result.obs.isfinite().all() and result.reward[result.valid].isfinite().all()
+    others = torch.tensor([0, 1, 3])
+    assert torch.equal(result.obs[others], reference.obs[others])
+    assert torch.equal(result.reward[others], reference.reward[others])
+    env.close(), clean.close()
+
+
+@pytest.mark.parametrize("task", task_names())
 def test_a_task_says_what_a_success_is(task):
     """Verification compares success rates on two engines, evaluation ranks by the main metric."""
     record = get_task(task)
