@@ -127,7 +127,7 @@ class Evaluate:
     """Joint ranges; by default those the policy was trained with."""
     felt_damping: bool = False
     """In ``mujoco`` and ``warp``, let contacts feel the joints' damping, as Drake's do: a quick
-    guess of what Drake will say. Like the next three options: the result says so, and does not
+    guess of what Drake will say. Like the next four options: the result says so, and does not
     compare with the others."""
     timestep_divisor: int = 1
     """2 halves the physics time step of ``mujoco`` and ``warp`` at the same control rate."""
@@ -135,6 +135,9 @@ class Evaluate:
     """In ``mujoco`` and ``warp``, play in worlds that differ, as in training."""
     variation: Variation = field(default_factory=Variation)
     """How they do, and how widely."""
+    like_drake: bool = False
+    """In ``mujoco`` and ``warp``, play in worlds that come as near to Drake as MuJoCo's do, as
+    ``train --like-drake`` does: the best quick guess of what Drake will say."""
     likeness: Path | None = None
     """Print how human the motion looks beside the score: ``reference`` compares it with the shipped
     figures of people, a clip library with its held-out clips (``olympics-opt likeness``)."""

@@ -141,9 +141,10 @@ def run_evaluate(config: Evaluate) -> int:
             raise ValueError(
                 "contacts always feel the joints' damping in drake: leave out felt-damping"
             )
-        if config.vary or config.timestep_divisor != 1:
+        if config.vary or config.like_drake or config.timestep_divisor != 1:
             raise ValueError(
-                "drake has worlds and steps of its own: leave --vary and the divisor out"
+                "drake has worlds and steps of its own: leave --vary, --like-drake and the divisor "
+                "out"
             )
     for mistake in mistakes(config):
         raise ValueError(mistake)

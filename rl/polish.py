@@ -238,7 +238,7 @@ def _share(config: Polish, policy: Policy, options: dict[str, Any] | None) -> Sh
     """The episodes of a generation."""
     athlete = as_trained(policy, config.name, config.strength, config.limits, options)
     physics = engine_options(config, config.seed)
-    if config.vary:
+    if "variation" in physics:
         physics["variation_blocks"] = config.blocks
     return Share(
         task=config.name,
@@ -345,7 +345,7 @@ def _about(config: Polish, policy: Policy) -> dict[str, Any]:
 
 def _worlds(config: Polish, options: dict[str, Any] | None) -> dict[str, Any]:
     """What the episodes were played in, where it is not the task's own."""
-    names = ("engine", "start_noise", "timestep_divisor", "felt_damping", "vary")
+    names = ("engine", "start_noise", "timestep_divisor", "felt_damping", "vary", "like_drake")
     told = {name: getattr(config, name) for name in names} | {"task": options or {}}
     given, usual = vars(config.variation), vars(Variation())
     told["variation"] = {name: x for name, x in given.items() if x != usual[name]}

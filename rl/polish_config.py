@@ -70,6 +70,8 @@ class Polish:
     policy is worth in all of them."""
     variation: Variation = field(default_factory=Variation)
     """How, with ``--vary``: ranges and shares of worlds."""
+    like_drake: bool = False
+    """The worlds of a candidate differ as with ``train --like-drake``."""
     seed: int = 0
     """Seed of all randomness."""
     strength: Literal["paper", "human"] | None = None
@@ -93,7 +95,7 @@ class Polish:
             raise ValueError("the first spreads must be positive")
         if self.joints and self.components < 0:
             raise ValueError("no action is shifted with components -1: leave --joints out")
-        if self.engine == "drake" and (self.vary or self.felt_damping):
+        if self.engine == "drake" and (self.vary or self.like_drake or self.felt_damping):
             raise ValueError("in drake no worlds vary and all contacts feel the damping")
         for mistake in world_mistakes(self):
             raise ValueError(mistake)

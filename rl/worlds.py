@@ -8,6 +8,9 @@ from typing import Any, Protocol
 
 from sports.variation import Variation
 
+DRAKE = Variation(friction=(0.8, 1.25), felt_share=0.8, cone_share=1.0, impratio=(2.0, 40.0))
+"""Worlds that come as near to Drake as MuJoCo's do: feet stick, and contacts feel the damping."""
+
 
 class Worlds(Protocol):
     """Settings that several commands have."""
@@ -32,6 +35,11 @@ class Worlds(Protocol):
         """How."""
         ...
 
+    @property
+    def like_drake(self) -> bool:
+        """They differ as in ``DRAKE``."""
+        ...
+
 
 def mistakes(worlds: Worlds) -> Iterator[str]:
     """What cannot be, as sentences."""
@@ -39,6 +47,8 @@ def mistakes(worlds: Worlds) -> Iterator[str]:
         yield f"timestep-divisor must be at least 1, not {worlds.timestep_divisor}"
     if worlds.variation != Variation() and not worlds.vary:
         yield "the --variation options are of worlds that vary: give --vary as well"
+    if worlds.like_drake and (worlds.vary or worlds.felt_damping):
+        yield "--like-drake says how worlds differ: leave --vary and --felt-damping out"
     if worlds.variation.own_stride != 1:
         yield "own-stride is the timestep-divisor: leave --variation.own-stride out"
     if worlds.variation.own_share and worlds.felt_damping:
@@ -48,7 +58,8 @@ def mistakes(worlds: Worlds) -> Iterator[str]:
 def engine_options(worlds: Worlds, seed: int) -> dict[str, Any]:
     """The engine's options for such worlds, drawn with a seed."""
     options: dict[str, Any] = {"felt_damping": True} if worlds.felt_damping else {}
-    if worlds.vary:
-        variation = replace(worlds.variation, own_stride=worlds.timestep_divisor)
+    if worlds.vary or worlds.like_drake:
+        how = DRAKE if worlds.like_drake else worlds.variation
+        variation = replace(how, own_stride=worlds.timestep_divisor)
         options |= {"variation": variation, "variation_seed": seed}
     return options

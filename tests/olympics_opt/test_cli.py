@@ -232,18 +232,26 @@ def test_worlds_that_vary_are_played_and_told(tmp_path: Path, capsys):
     finer = "--timestep-divisor 4"
     varied = f"{finer} --vary --variation.rebound-share 1 --variation.friction 1 1"
     results = []
-    for name, options in (("plain", ""), ("finer", finer), ("varied", varied), ("again", varied)):
+    for name, options in (
+        ("plain", ""),
+        ("finer", finer),
+        ("varied", varied),
+        ("again", varied),
+        ("drake", "--like-drake"),
+    ):
         out = tmp_path / f"{name}.json"
         assert cli.main(f"{line} {options} --out {out}".split()) == 0
         results.append(json.loads(out.read_text()))
-    plain, fine, other, again = results
+    plain, fine, other, again, drake = results
     assert "timestep_divisor" not in plain and "variation" not in fine
     assert fine["timestep_divisor"] == 4 and fine["substeps"] == 4 * plain["substeps"]
     assert other["variation"]["rebound_share"] == 1.0 and other["variation"]["own_stride"] == 4
     assert other["metrics"] == again["metrics"]
+    assert drake["variation"]["impratio"] == [2.0, 40.0] and drake["timestep"] == plain["timestep"]
     out = tmp_path / "wrong.json"
     for wrong, told in (
         ("--engine drake --vary", "drake has worlds and steps of its own"),
+        ("--engine drake --like-drake", "drake has worlds and steps of its own"),
         ("--engine drake --timestep-divisor 2", "drake has worlds and steps of its own"),
         ("--variation.rebound-share 1", "give --vary as well"),
         ("--timestep-divisor 0", "must be at least 1"),

@@ -21,9 +21,11 @@ from rl.assembly import default_env
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.config import config_from_dict
 from rl.policy import PolicyError, load_policy
+from rl.polish_config import Polish
 from rl.ppo import PAPER, PPOConfig
 from rl.runlog import read_progress
 from rl.train import TrainConfig, main, parse_args, train
+from rl.worlds import engine_options
 from sports.env import make_env
 from sports.physics.variation import Variation, draw
 from tests.rl.toy import SMALL, Integrator, toy_config, toy_env
@@ -335,14 +337,29 @@ def test_a_share_of_own_worlds_reaches_the_worlds():
     assert torch.equal((moved[0] == moved[1]).all(1), own)
 
 
+def test_like_drake_is_short_for_worlds_with_feet_that_stick():
+    """Of its five options on the command line, and for evaluations and searches alike."""
+    words = "--vary --variation.friction 0.8 1.25 --variation.felt-share 0.8"
+    words += " --variation.cone-share 1 --variation.impratio 2 40 --timestep-divisor 2"
+    long = engine_options(parse_args(["long_jump", *words.split()]), 5)
+    short = engine_options(parse_args(["long_jump", "--like-drake", "--timestep-divisor", "2"]), 5)
+    assert short == long and short["variation"].own_stride == 2
+    search = Polish("long_jump", "zero", Path("x"), minutes=1, like_drake=True, timestep_divisor=2)
+    assert engine_options(search, 5) == long
+    assert not engine_options(parse_args(["long_jump"]), 5)
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
+        (dict(like_drake=True, vary=True), "leave --vary and --felt-damping out"),
+        (dict(like_drake=True, felt_damping=True), "leave --vary and --felt-damping out"),
+        (dict(variation=OWN, like_drake=True), "give --vary as well"),
         (dict(variation=OWN), "give --vary as well"),
         (dict(variation=Variation(own_stride=2), vary=True), "is the timestep-divisor"),
         (dict(variation=OWN, vary=True, felt_damping=True), "leave --variation.own-share"),
     ],
 )
-def test_own_worlds_that_cannot_be_are_refused(given, words):
+def test_worlds_that_cannot_be_are_refused(given, words):
     with pytest.raises(ValueError, match=words):
         TrainConfig("long_jump", **given)
