@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from olympics_opt.speeds import Measured, read_measured, sections
+from rl.worlds import OTHER_PHYSICS
 from warmstart import atomic
 
 BEGIN, END = "<!-- results -->", "<!-- /results -->"
 REQUIRED = ("task", "algo", "engine", "strength", "trials", "seed", "commit", "metrics")
-OTHER_PHYSICS = {"felt_damping", "timestep_divisor", "variation"}
-"""Fields of results that were played in physics other than the task's own."""
 PAPER_COLUMNS = ("PPO", "AMP", "PULSE", "PULSE + AMP")
 PAPER_METHOD = {"amp": "AMP", "latent": "PULSE", "latent-amp": "PULSE + AMP"}
 """The paper's method beside which an algorithm of ours stands; PPO for the others."""

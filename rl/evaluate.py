@@ -12,7 +12,7 @@ import multiprocessing
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from rl import provenance
 from rl.policy import Policy, as_trained, load_policy
 from rl.recording import Recording
 from rl.trials import Played, Share, play_share, ranked, standing_starts
+from rl.worlds import other_physics
 from sports.env import make_scene
 from sports.registry import get_task
 from sports.starts import START_NOISE
@@ -167,22 +168,10 @@ def evaluate(
     }
     if policy.prior is not None:
         result["prior_digest"] = policy.prior.digest
-    result |= _other_physics(physics_options or {}, timestep_divisor)
+    result |= other_physics(physics_options or {}, timestep_divisor)
     for recording in recordings.values():
         recording.meta |= {"policy_sha256": card["sha256"], "commit": result["commit"]}
     return EvaluationResult(result, values, recordings)
-
-
-def _other_physics(physics_options: dict[str, Any], timestep_divisor: int) -> dict[str, Any]:
-    """What a result says where the physics was not the task's own."""
-    other: dict[str, Any] = {}
-    if physics_options.get("felt_damping"):
-        other["felt_damping"] = True
-    if timestep_divisor != 1:
-        other["timestep_divisor"] = timestep_divisor
-    if "variation" in physics_options:
-        other["variation"] = asdict(physics_options["variation"])
-    return other
 
 
 def interval(values: np.ndarray, unit: str) -> dict[str, Any]:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, replace
 from typing import Any, Protocol
 
 from sports.variation import Variation
 
 DRAKE = Variation(friction=(0.8, 1.25), felt_share=0.8, cone_share=1.0, impratio=(2.0, 40.0))
 """Worlds that come as near to Drake as MuJoCo's do: feet stick, and contacts feel the damping."""
+
+OTHER_PHYSICS = frozenset({"felt_damping", "timestep_divisor", "variation"})
+"""Fields of results that were played in physics other than the task's own."""
 
 
 class Worlds(Protocol):
@@ -63,3 +66,15 @@ def engine_options(worlds: Worlds, seed: int) -> dict[str, Any]:
         variation = replace(how, own_stride=worlds.timestep_divisor)
         options |= {"variation": variation, "variation_seed": seed}
     return options
+
+
+def other_physics(options: Mapping[str, Any], timestep_divisor: int) -> dict[str, Any]:
+    """``OTHER_PHYSICS`` of a result, from the engine's options; empty where it was the task's."""
+    other: dict[str, Any] = {}
+    if options.get("felt_damping"):
+        other["felt_damping"] = True
+    if timestep_divisor != 1:
+        other["timestep_divisor"] = timestep_divisor
+    if "variation" in options:
+        other["variation"] = asdict(options["variation"])
+    return other
