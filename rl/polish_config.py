@@ -95,8 +95,6 @@ class Polish:
             raise ValueError("the first spreads must be positive")
         if self.joints and self.components < 0:
             raise ValueError("no action is shifted with components -1: leave --joints out")
-        if self.engine == "drake" and (self.vary or self.like_drake or self.felt_damping):
-            raise ValueError("in drake no worlds vary and all contacts feel the damping")
         for mistake in world_mistakes(self):
             raise ValueError(mistake)
         if self.generations is None and self.minutes is None:

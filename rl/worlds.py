@@ -19,6 +19,11 @@ class Worlds(Protocol):
     """Settings that several commands have."""
 
     @property
+    def engine(self) -> str:
+        """The physics engine."""
+        ...
+
+    @property
     def timestep_divisor(self) -> int:
         """2 halves the physics time step at the same control rate."""
         ...
@@ -48,6 +53,10 @@ def mistakes(worlds: Worlds) -> Iterator[str]:
     """What cannot be, as sentences."""
     if worlds.timestep_divisor < 1:
         yield f"timestep-divisor must be at least 1, not {worlds.timestep_divisor}"
+    if worlds.engine == "drake" and (worlds.vary or worlds.like_drake):
+        yield "drake has worlds of its own: leave --vary and --like-drake out"
+    if worlds.engine == "drake" and worlds.felt_damping:
+        yield "contacts always feel the joints' damping in drake: leave --felt-damping out"
     if worlds.variation != Variation() and not worlds.vary:
         yield "the --variation options are of worlds that vary: give --vary as well"
     if worlds.like_drake and (worlds.vary or worlds.felt_damping):

@@ -250,9 +250,9 @@ def test_worlds_that_vary_are_played_and_told(tmp_path: Path, capsys):
     assert drake["variation"]["impratio"] == [2.0, 40.0] and drake["timestep"] == plain["timestep"]
     out = tmp_path / "wrong.json"
     for wrong, told in (
-        ("--engine drake --vary", "drake has worlds and steps of its own"),
-        ("--engine drake --like-drake", "drake has worlds and steps of its own"),
-        ("--engine drake --timestep-divisor 2", "drake has worlds and steps of its own"),
+        ("--engine drake --vary", "drake has worlds of its own"),
+        ("--engine drake --like-drake", "drake has worlds of its own"),
+        ("--engine drake --timestep-divisor 2", "drake has time steps of its own"),
         ("--variation.rebound-share 1", "give --vary as well"),
         ("--timestep-divisor 0", "must be at least 1"),
         ("--vary --variation.rebound-share 1 --variation.rebound-links Sword", "no link"),

@@ -233,7 +233,7 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path):
         ({"part": (0.8, 0.2)}, "two shares"),
         ({"part": (0.8, 0.9), "components": 0}, "--components of 1"),
         ({"variation": Variation(uneven=0.1)}, "--vary as well"),
-        ({"vary": True, "engine": "drake"}, "in drake no worlds vary"),
+        ({"vary": True, "engine": "drake"}, "drake has worlds of its own"),
         ({"joints": ("R_*",), "components": -1, "others": ("zero",)}, "--joints"),
     ):
         with pytest.raises(ValueError, match=said):
