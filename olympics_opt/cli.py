@@ -137,8 +137,8 @@ class Evaluate:
     """How they do, and how widely."""
     like_drake: bool = False
     """In ``mujoco`` and ``warp``, play in worlds that come as near to Drake as MuJoCo's do, as
-    ``train --like-drake`` does: a guess of what Drake will say, by and large no better than it, and
-    too gloomy where a finger's breadth decides (docs/physics.md, "Feet that creep")."""
+    ``train --like-drake`` does: a quick guess of what Drake will say, right about falls and jumps,
+    too gloomy where precision decides (docs/physics.md, "Feet that creep")."""
     likeness: Path | None = None
     """Print how human the motion looks beside the score: ``reference`` compares it with the shipped
     figures of people, a clip library with its held-out clips (``olympics-opt likeness``)."""
