@@ -80,7 +80,7 @@ class TrainConfig:
     like_drake: bool = False
     """Let the worlds differ so that what is learned holds in Drake: feet stick instead of creeping,
     and contacts feel the joints' damping in four worlds of five (``rl.worlds.DRAKE``;
-    docs/physics.md, "Feet that creep"). Short for ``--vary`` with five of its options; a
+    docs/physics.md, "Feet that creep"). Short for ``--vary`` with four of its options; a
     ``timestep_divisor`` of 2 brings finer steps in."""
     felt_damping: bool = False
     """Contacts feel the joints' damping in all worlds, as in Drake (docs/physics.md). The policy is

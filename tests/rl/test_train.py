@@ -338,7 +338,7 @@ def test_a_share_of_own_worlds_reaches_the_worlds():
 
 
 def test_like_drake_is_short_for_worlds_with_feet_that_stick():
-    """Of its five options on the command line, and for evaluations and searches alike."""
+    """Of its four options on the command line, and for evaluations and searches alike."""
     words = "--vary --variation.friction 0.8 1.25 --variation.felt-share 0.8"
     words += " --variation.cone-share 1 --variation.impratio 2 40 --timestep-divisor 2"
     long = engine_options(parse_args(["long_jump", *words.split()]), 5)
