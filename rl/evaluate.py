@@ -107,6 +107,8 @@ def evaluate(
     """
     if trials < 1:
         raise ValueError(f"trials must be at least 1, not {trials}")
+    if processes is not None and processes < 1:
+        raise ValueError(f"at least one process is needed, not {processes}")
     get_task(task)
     if not isinstance(policy, Policy):
         policy = load_policy(policy, task)

@@ -201,6 +201,8 @@ def test_mistakes_are_sentences():
         evaluate("zero", "high_jump", options={"height": 1})
     with pytest.raises(ValueError, match="trials"):
         evaluate("zero", "high_jump", trials=0)
+    with pytest.raises(ValueError, match="process"):
+        evaluate("zero", "high_jump", engine="drake", trials=4, processes=0)
     with pytest.raises(ValueError, match="engine"):
         evaluate("zero", "high_jump", engine="bullet", trials=1)
 
