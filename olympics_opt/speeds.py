@@ -1,4 +1,5 @@
-"""Tables of what ``bench`` measured: speed of each task on each engine, and endurance.
+"""Tables of what was measured of speed: each task on each engine, and endurance (``bench``), and
+training on several GPUs (``rl.scaling``).
 
 They stand in ``results/README.md`` beside the results; every figure comes from a file.
 """
@@ -16,38 +17,42 @@ Rows = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class Measured:
-    """What a folder holds of ``bench``: each row with ``file``, ``hardware`` and ``commit``."""
+    """What a folder holds: each row with ``file``, ``hardware`` and ``commit``."""
 
     speeds: Rows
     soaks: Rows
+    scalings: Rows
 
 
 def read_measured(folder: str | Path) -> Measured:
-    """Every row that ``bench`` and ``bench --soak`` wrote into files of a folder, by task, engine
-    and number of worlds. Raises ValueError naming a row that lacks what a table needs."""
-    speeds, soaks = [], []
+    """Every row that ``bench``, ``bench --soak`` and ``rl.scaling`` wrote into files of a folder,
+    by task, engine and number of worlds, those of ``rl.scaling`` by number of processes, too.
+    Raises ValueError naming a row that lacks what a table needs."""
+    speeds, soaks, scalings = [], [], []
     for path in sorted(Path(folder).glob("*.json")):
         data = json.loads(path.read_text())
         if not isinstance(data, dict):
             continue
-        origin = {name: data.get(name, "") for name in ("commit", "hardware")}
-        for key, found, needed in (
-            ("rows", speeds, "environment"),
-            ("soak", soaks, "steps_per_second"),
+        shared = ("commit", "hardware", *(("task", "engine") if "warm_up_s" in data else ()))
+        origin = {name: data.get(name, "") for name in shared}
+        for key, mark, found, needed in (  # files of other kinds have rows, too
+            ("rows", "steps_per_turn", speeds, "environment"),
+            ("rows", "warm_up_s", scalings, "processes"),
+            ("soak", "soak", soaks, "steps_per_second"),
         ):
             rows = data.get(key)
-            # Files of other kinds have rows, too.
-            if not isinstance(rows, list) or (key == "rows" and "steps_per_turn" not in data):
+            if not isinstance(rows, list) or mark not in data:
                 continue
             for row in rows:
-                if not isinstance(row, dict) or "task" not in row or needed not in row:
+                whole = {**origin, **row} if isinstance(row, dict) else {}
+                if not whole.get("task") or needed not in whole:
                     raise ValueError(f"{path}: a row of '{key}' lacks its task or '{needed}'")
-                found.append({**origin, **row, "file": path.name})
+                found.append({**whole, "file": path.name})
 
     def order(row: Mapping[str, Any]) -> tuple[Any, ...]:
-        return row["task"], row["engine"], row["worlds"], row["file"]
+        return row["task"], row["engine"], row["worlds"], row["file"], row.get("processes", 0)
 
-    return Measured(sorted(speeds, key=order), sorted(soaks, key=order))
+    return Measured(*(sorted(rows, key=order) for rows in (speeds, soaks, scalings)))
 
 
 SPEED = (
@@ -57,6 +62,10 @@ SPEED = (
 )
 ENDURANCE = (
     "Random actions for so many control steps of each world, by `olympics-opt bench --soak`."
+)
+SCALING = (
+    "Training with `torchrun`, a process for each GPU with so many worlds, by "
+    "`python -m rl.scaling`: samples of all of them a second, and how many times one's."
 )
 
 
@@ -71,6 +80,10 @@ def sections(measured: Measured) -> list[tuple[str, str, list[str], list[list[st
         head = ["task", "engine", "worlds", "steps", "episodes", "not finite", "diverged"]
         head += ["overflow", "GPU GiB, then", "steps/s", "hardware", "commit", "file"]
         out.append(("Endurance", ENDURANCE, head, [_soak(row) for row in measured.soaks]))
+    if measured.scalings:
+        head = ["task", "engine", "worlds of each", "processes", "samples/s", "times one"]
+        head += ["rollout s", "update s", "hardware", "commit", "file"]
+        out.append(("Several GPUs", SCALING, head, [_scaling(row) for row in measured.scalings]))
     return out
 
 
@@ -98,6 +111,19 @@ def _soak(row: Mapping[str, Any]) -> list[str]:
         overflowed(row),
         _gib(row.get("device_memory_gib") or [None]),
         rate(row["steps_per_second"]),
+        *_origin(row),
+    ]
+
+
+def _scaling(row: Mapping[str, Any]) -> list[str]:
+    ratio = row.get("ratio")
+    return [
+        *_which(row),
+        str(row["processes"]),
+        rate(row["samples_per_s"]),
+        "–" if ratio is None else f"{ratio:.2f}",
+        f"{row['rollout_s']:.3f}",
+        f"{row['update_s']:.3f}",
         *_origin(row),
     ]
 

@@ -158,12 +158,13 @@ def measure(config: ScalingConfig, more: Sequence[str] = ()) -> list[Point]:
             efficiency = ratio / processes if ratio else None
             point = Point(processes, config.num_worlds, ratio=ratio, efficiency=efficiency, **found)
             points.append(point)
-            _write(config, more, points)
+            write_points(config, more, points)
             print(_line(point), flush=True)
     return points
 
 
-def _write(config: ScalingConfig, more: Sequence[str], points: Sequence[Point]) -> None:
+def write_points(config: ScalingConfig, more: Sequence[str], points: Sequence[Point]) -> None:
+    """The JSON file of what was measured, with where and of which commit."""
     data = {
         "task": config.task,
         "engine": config.engine,

@@ -11,6 +11,7 @@ import pytest
 from olympics_opt import leaderboard
 from olympics_opt.bench import bench, soak_all
 from olympics_opt.speeds import overflowed
+from rl.scaling import Point, ScalingConfig, write_points
 
 
 def result(**changes) -> dict:
@@ -117,6 +118,22 @@ def test_our_metrics_have_the_papers_names():
         units = get_task(task).metrics
         for name, row in paper[task].items():
             assert re.fullmatch(re.escape(row["unit"]), units[name]), (task, name)
+
+
+def test_scaling_has_a_table(folder: Path):
+    points = [
+        Point(n, 8192, samples, samples / 3e5, samples / 3e5 / n, 0.5, 0.1, 50, 30.0)
+        for n, samples in ((4, 1.14e6), (1, 3e5))
+    ]
+    config = ScalingConfig("long_jump", out=folder / "scaling.json")
+    write_points(config, ["--vary"], points)
+    leaderboard.rebuild(folder, None)
+    page = (folder / "README.md").read_text()
+    rows = [line for line in page.splitlines() if "[scaling.json]" in line]
+    assert rows[0].startswith("| long_jump | warp | 8192 | 1 | 300.0 k | 1.00 |")
+    assert rows[1].startswith("| long_jump | warp | 8192 | 4 | 1140.0 k | 3.80 |")
+    head = next(line for line in page.splitlines() if "times one" in line)
+    assert head.count(" | ") == rows[0].count(" | ")
 
 
 def test_speeds_and_endurance_have_tables(folder: Path):
