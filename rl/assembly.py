@@ -35,6 +35,7 @@ from rl.rollout import Actor, Rollout
 from rl.warm_start import load_start
 from rl.worlds import engine_options
 from sports.env import Env, Starts, make_env
+from sports.variation import Variation
 
 MakeEnv = Callable[[TrainConfig, int], Any]
 """(config, seed) -> environment."""
@@ -111,7 +112,7 @@ def assemble(config: TrainConfig, starts: Starts | None, make: MakeEnv) -> Assem
     first = None if resumed else config.init
     if first:
         config = _shaped_like(config, first)
-    env = make(config, config.seed + 7919 * rank)
+    env = make(of_rank(config, rank, ranks), config.seed + 7919 * rank)
     if starts is None:
         starts = _starts_of_clips(config)
     if starts is not None:
@@ -159,6 +160,27 @@ def assemble(config: TrainConfig, starts: Starts | None, make: MakeEnv) -> Assem
         warmup=warmup,
         first_learning=first_learning,
         unseen=unseen,
+    )
+
+
+def of_rank(config: TrainConfig, rank: int, ranks: int) -> TrainConfig:
+    """What a rank's worlds are made of: those of the last ``own_ranks`` are the task's own. Raises
+    ValueError where that leaves no other."""
+    if config.own_ranks >= ranks and config.own_ranks:
+        raise ValueError(
+            f"--own-ranks {config.own_ranks} leaves none of {ranks} processes for the other "
+            "worlds: start more with torchrun"
+        )
+    if rank < ranks - config.own_ranks:
+        return config
+    return replace(
+        config,
+        vary=False,
+        variation=Variation(),
+        like_drake=False,
+        felt_damping=False,
+        timestep_divisor=1,
+        own_ranks=0,
     )
 
 

@@ -85,6 +85,11 @@ class TrainConfig:
     felt_damping: bool = False
     """Contacts feel the joints' damping in all worlds, as in Drake (docs/physics.md). The policy is
     then one for Drake, and may fail in evaluations on mujoco without it."""
+    own_ranks: int = 0
+    """With torchrun, so many processes play in the task's own worlds at its own time step, whatever
+    the options above say of the others: on a GPU friction has one cone for all worlds of a process,
+    and a runner who knows the one may fall in the other (docs/physics.md, "A pyramid or a
+    cone")."""
     init: str | None = None
     """Start from this policy: a run, a policy file, or pretrained[:ALGO[-STRENGTH]]; also that of
     another task with the same body (tennis for tennis_1v1). The statistics of what it observes stay
@@ -203,6 +208,10 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
     if not all(0.0 <= p <= 1.0 for p in c.start_probability):
         yield f"start_probability must lie in [0, 1], not {c.start_probability}"
     yield from world_mistakes(c)
+    if c.own_ranks < 0:
+        yield f"own-ranks must not be negative: {c.own_ranks}"
+    if c.own_ranks and not (c.vary or c.like_drake or c.felt_damping or c.timestep_divisor > 1):
+        yield "all processes play in the task's own worlds: leave --own-ranks out, or give --vary"
     if c.clone < 0:
         yield f"clone must not be negative: {c.clone}"
 
