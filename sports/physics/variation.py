@@ -118,7 +118,7 @@ def draw(
         values[name] = np.where(own, 1.0, values[name])
     stride, felt = np.where(own, variation.own_stride, stride), felt & ~own
     side = np.where(own, 0.0, uniform((-variation.uneven, variation.uneven)))
-    cone = (rng.random(num_worlds) < variation.cone_share) & ~own
+    cone = (rng.random(num_worlds) < variation.cone_share) & (~own | variation.own_cone)
     rebound = (rng.random(num_worlds) < variation.rebound_share) & ~own
     stride = np.where(rebound, 1, stride)
     low, high = np.log(variation.impratio)

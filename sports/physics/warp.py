@@ -96,7 +96,7 @@ class WarpPhysics:
             elif drawn.cone.any():
                 raise ValueError(
                     "on a GPU friction has a round cone in all worlds or in none: give a "
-                    "cone_share of 0, or of 1 with an own_share of 0"
+                    "cone_share of 0, or of 1 with an own_share of 0 or an own_cone"
                 )
         holds = any(o.holdable for o in scene.objects)
         model.opt.iterations = iterations or (HOLD_ITERATIONS if holds else ITERATIONS)

@@ -417,6 +417,8 @@ def test_a_share_of_the_worlds_that_vary_has_a_round_cone_of_friction(monkeypatc
     round_ones = torch.tensor(drawn.cone)
     assert 0 < drawn.cone.sum() < n
     assert not draw(Variation(own_share=1.0, cone_share=1.0), n, scene.substeps, 0).cone.any()
+    own = Variation(own_share=1.0, cone_share=1.0, own_cone=True)
+    assert draw(own, n, scene.substeps, 0).cone.all()
     monkeypatch.setattr(engine, "draw", lambda *_: drawn)
     varied, pyramids = cpu(scene, n, variation=plain), cpu(scene, n)
     model = build_model(scene)
