@@ -65,8 +65,8 @@ class Variation:
     """Share of worlds that are the task's own, in which nothing is drawn and contacts do not feel
     the damping: for a policy that must also hold there."""
     own_cone: bool = False
-    """``cone_share`` is of the task's own worlds as well. With both shares 1 they are as they are but
-    for the round cone: a policy that is another one there leans on the corners of the pyramid
+    """``cone_share`` is of the task's own worlds as well. With both shares 1 all are the task's own
+    but for the round cone: a policy that is another one there leans on the corners of the pyramid
     (docs/physics.md, "A pyramid or a cone")."""
     own_stride: int = 1
     """Substeps that those take in one: the ``timestep_divisor``, so that theirs is the task's own
