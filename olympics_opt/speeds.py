@@ -33,8 +33,8 @@ def read_measured(folder: str | Path) -> Measured:
         data = json.loads(path.read_text())
         if not isinstance(data, dict):
             continue
-        shared = ("commit", "hardware", *(("task", "engine") if "warm_up_s" in data else ()))
-        origin = {name: data.get(name, "") for name in shared}
+        names = ("commit", "hardware", "task", "engine")
+        origin = {"commit": "", "hardware": ""} | {n: data[n] for n in names if n in data}
         for key, mark, found, needed in (  # files of other kinds have rows, too
             ("rows", "steps_per_turn", speeds, "environment"),
             ("rows", "warm_up_s", scalings, "processes"),
@@ -45,7 +45,7 @@ def read_measured(folder: str | Path) -> Measured:
                 continue
             for row in rows:
                 whole = {**origin, **row} if isinstance(row, dict) else {}
-                if not whole.get("task") or needed not in whole:
+                if "task" not in whole or needed not in whole:
                     raise ValueError(f"{path}: a row of '{key}' lacks its task or '{needed}'")
                 found.append({**whole, "file": path.name})
 

@@ -166,7 +166,7 @@ def assemble(config: TrainConfig, starts: Starts | None, make: MakeEnv) -> Assem
 def of_rank(config: TrainConfig, rank: int, ranks: int) -> TrainConfig:
     """What a rank's worlds are made of: those of the last ``own_ranks`` are the task's own. Raises
     ValueError where that leaves no other."""
-    if config.own_ranks >= ranks and config.own_ranks:
+    if config.own_ranks >= ranks:
         raise ValueError(
             f"--own-ranks {config.own_ranks} leaves none of {ranks} processes for the other "
             "worlds: start more with torchrun"
