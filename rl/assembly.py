@@ -171,7 +171,7 @@ def of_rank(config: TrainConfig, rank: int, ranks: int) -> TrainConfig:
             f"--own-ranks {config.own_ranks} leaves none of {ranks} processes for the other "
             "worlds: start more with torchrun"
         )
-    if rank < ranks - config.own_ranks:
+    if not plays_own(config, rank, ranks):
         return config
     return replace(
         config,
@@ -182,6 +182,11 @@ def of_rank(config: TrainConfig, rank: int, ranks: int) -> TrainConfig:
         timestep_divisor=1,
         own_ranks=0,
     )
+
+
+def plays_own(config: TrainConfig, rank: int, ranks: int) -> bool:
+    """Whether a rank is one of the last ``own_ranks``."""
+    return rank >= ranks - config.own_ranks
 
 
 def default_env(config: TrainConfig, seed: int) -> Env:

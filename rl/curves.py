@@ -22,6 +22,7 @@ DIGITS = 6
 """Of every number that is not whole: more are noise, and most of the file."""
 KEPT = ("samples", "minutes", "return", "episode_steps", "samples_per_s", "nan_worlds", "overflow")
 KEPT += ("middle", "candidates")
+GROUPS = ("metrics/", "own/", "others/", "curriculum/")
 ORIGIN = ("task", "algo", "strength", "limits", "commit", "hardware", "versions", "config")
 
 
@@ -47,7 +48,7 @@ def record_curve(
         raise ValueError(f"{progress} is no learning curve: it needs rows and a column 'samples'")
     last = len(rows) - 1
     picked = sorted({round(i * last / max(points - 1, 1)) for i in range(points)} | {last})
-    names = [k for k in rows[0] if k in KEPT or k.startswith(("metrics/", "curriculum/"))]
+    names = [k for k in rows[0] if k in KEPT or k.startswith(GROUPS)]
     columns = {name: [_number(rows[i][name]) for i in picked] for name in names}
     origin = {name: card[name] for name in ORIGIN if name in card}
     if "middle" in rows[0] and "polish" in card:

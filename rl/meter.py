@@ -10,6 +10,13 @@ from torch import Tensor
 _HEAD = ("steps", "invalid", "episodes", "return", "episode_steps")
 
 
+def apart(totals: Tensor, second: bool) -> Tensor:
+    """(2 K,) ``totals`` (K,) as the first half or the second, and zeros: when ranks add theirs up,
+    those of two kinds stay apart."""
+    none = torch.zeros_like(totals)
+    return torch.cat((none, totals) if second else (totals, none))
+
+
 class EpisodeMeter:
     """Adds up what every step reports: rewards by term, and each ended episode's metrics.
 
@@ -70,6 +77,11 @@ class EpisodeMeter:
         for k, name in enumerate(self._terms):
             out[f"terms/{name}"] = totals[at + k] / max(steps, 1.0)
         return out
+
+    def metrics(self, totals: list[float], prefix: str) -> dict[str, float | int | None]:
+        """Those of ``summary`` that are metrics, under other names."""
+        found = self.summary(totals)
+        return {f"{prefix}{name}": found[f"metrics/{name}"] for name in self._metrics}
 
     def state_dict(self) -> dict[str, Tensor]:
         """Running episodes' returns and lengths."""

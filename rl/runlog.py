@@ -129,6 +129,8 @@ def _line(row: Row, share: float) -> str:
     words = [f"{share:4.0%}", f"iteration {row['iteration']}"]
     words += [f"{name} {_text(row[name])}" for name in _SHOWN if name in row]
     words += [f"{k[8:]} {_text(v)}" for k, v in row.items() if k.startswith("metrics/")]
+    kinds = ("own/", "others/")
+    words += [f"{k.replace('/', ' ')} {_text(v)}" for k, v in row.items() if k.startswith(kinds)]
     return " | ".join(words)
 
 
@@ -145,7 +147,7 @@ def _panel(row: Row, share: float) -> Any:
         return grid
 
     groups = [table("learning", [*_SHOWN, "explained_variance", "episodes"])]
-    for section in ("metrics", "terms", "curriculum"):
+    for section in ("metrics", "own", "others", "terms", "curriculum"):
         names = [k for k in row if k.startswith(section + "/")]
         if names:
             groups.append(table(section, names))

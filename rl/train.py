@@ -20,10 +20,11 @@ import torch.distributed as dist
 from torch import Tensor
 
 from rl import latent_run
-from rl.assembly import Assembly, MakeEnv, assemble, default_env
+from rl.assembly import Assembly, MakeEnv, assemble, default_env, plays_own
 from rl.checkpoint import CheckpointError
 from rl.config import DEFAULT_SAMPLES, PRIOR, TrainConfig, load_starts, parse_args
 from rl.host import Signals, Stopwatch, join_ranks, one_torch_thread
+from rl.meter import apart
 from rl.profiling import profile_training
 from rl.ranks import over_ranks
 from rl.rate_watch import RateWatch
@@ -325,6 +326,8 @@ class _Trainer:
         physics = getattr(self.env, "physics", None)
         counts = {k: getattr(physics, k, 0) for k in ("nan_worlds", "overflow")}
         episodes = self.made.meter.totals().to(self.device)
+        if self.config.own_ranks:
+            episodes = apart(episodes, plays_own(self.config, self.rank, self.ranks))
         # Rank 0's clock decides for all: the others add 0 seconds.
         seconds = time.monotonic() - self.began if self.rank == 0 else 0.0
         own = (*counts.values(), torch.tensor(seconds, dtype=torch.float64))
@@ -341,8 +344,18 @@ class _Trainer:
             losses=dict(zip(losses, averages)),
             levels=dict(zip(levels, averages[len(losses) :])),
             counts={k: int(v) for k, v in zip(counts, totals[len(episodes) :])},
-            episodes=self.made.meter.summary(totals),
+            episodes=self._episodes(totals[: len(episodes)]),
         )
+
+    def _episodes(self, totals: list[float]) -> Row:
+        """What the episodes of all ranks came to; with ``own_ranks`` also those of each kind."""
+        meter = self.made.meter
+        if not self.config.own_ranks:
+            return meter.summary(totals)
+        half = len(totals) // 2
+        others, own = totals[:half], totals[half:]
+        told = meter.summary([a + b for a, b in zip(others, own)])
+        return told | meter.metrics(own, "own/") | meter.metrics(others, "others/")
 
     def _number(self, x: Tensor | int) -> Tensor:
         """(1,) float64 on the learner's device."""

@@ -55,12 +55,18 @@ def mistakes(worlds: Worlds) -> Iterator[str]:
         yield f"timestep-divisor must be at least 1, not {worlds.timestep_divisor}"
     if worlds.engine == "drake" and (worlds.vary or worlds.like_drake):
         yield "drake has worlds of its own: leave --vary and --like-drake out"
+    if worlds.engine == "drake" and worlds.timestep_divisor != 1:
+        yield "drake has time steps of its own: leave --timestep-divisor out"
     if worlds.engine == "drake" and worlds.felt_damping:
         yield "contacts always feel the joints' damping in drake: leave --felt-damping out"
-    if worlds.variation != Variation() and not worlds.vary:
+    told = worlds.variation != Variation()
+    if worlds.like_drake and (worlds.vary or told or worlds.felt_damping):
+        yield (
+            "--like-drake says how worlds differ: leave --vary, the --variation options and "
+            "--felt-damping out"
+        )
+    elif told and not worlds.vary:
         yield "the --variation options are of worlds that vary: give --vary as well"
-    if worlds.like_drake and (worlds.vary or worlds.felt_damping):
-        yield "--like-drake says how worlds differ: leave --vary and --felt-damping out"
     if worlds.variation.own_stride != 1:
         yield "own-stride is the timestep-divisor: leave --variation.own-stride out"
     if worlds.variation.own_share and worlds.felt_damping:

@@ -19,7 +19,7 @@ from rl.normalizer import Normalizer
 from rl.ppo import PPO, PPOConfig, gaussian_log_prob
 from rl.ranks import over_ranks
 from rl.style_features import Demonstrations
-from rl.train import train
+from rl.train import TrainConfig, train
 from tests.rl.motions_made import tables
 from tests.rl.toy import toy_config, toy_env
 from tests.warmstart.clips_made import random_clip
@@ -161,4 +161,16 @@ if __name__ == "__main__":
     train(toy_config(out / "run", samples=6 * 2048, resume=True), environment=toy_env)
     timed = train(toy_config(out / "timed", samples=None, minutes=0.02), environment=toy_env)
     (out / f"timed{dist.get_rank()}").write_text(f"{timed.stopped_by} {timed.iterations}")
+    hyper = PPOConfig(hidden=(16,), steps=48, minibatches=1, epochs=1)
+    kinds = TrainConfig(
+        "hurdling",
+        out / "both",
+        worlds=8,
+        samples=2 * 16 * hyper.steps,
+        like_drake=True,
+        own_ranks=1,
+        quiet=True,
+        ppo=hyper,
+    )
+    train(kinds)
     dist.destroy_process_group()

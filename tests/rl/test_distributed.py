@@ -143,6 +143,20 @@ def test_a_run_of_two_ranks_goes_on_with_one_and_back(together, tmp_path):
     assert not torch.equal(zero["agent/generator"], one["agent/generator"])
 
 
+def test_the_log_tells_own_worlds_from_others(together):
+    """Of ranks that play the task's own worlds and of the others, apart and together."""
+    rows = read_progress(together / "both")
+    assert len(rows) == 2 and json.loads((together / "both" / "config.json").read_text())
+    told = [r for r in rows if r["own/distance"] is not None and r["others/distance"] is not None]
+    assert told, "episodes ended in both"
+    for row in told:
+        both, own, others = (float(row[f"{k}/distance"]) for k in ("metrics", "own", "others"))  # type: ignore[arg-type]
+        assert min(own, others) <= both <= max(own, others) and own != others
+    last = checkpoints(together / "both")[-1]
+    zero, one = (load_checkpoint(last, r)[1] for r in (0, 1))
+    assert torch.equal(zero["agent/actor.head.weight"], one["agent/actor.head.weight"])
+
+
 def test_more_processes_than_gpus_are_refused_with_a_sentence(monkeypatch, capsys, tmp_path):
     monkeypatch.setenv("WORLD_SIZE", "4")
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from rl.assembly import default_env, of_rank
+from rl.assembly import default_env, of_rank, plays_own
 from rl.config import TrainConfig
+from rl.meter import apart
 from rl.train import main
 from rl.worlds import DRAKE
 from sports.env import make_env, make_scene
@@ -34,6 +35,14 @@ def test_the_last_rank_plays_the_task_as_it_is():
     assert other.physics.scene.timestep == make_scene("long_jump").timestep / 2
     assert not torch.equal(played(other), plain)
     assert DRAKE.own_share == 0.0, "the others have none of their own"
+
+
+def test_sums_of_the_two_kinds_stay_apart():
+    """Each of three ranks adds a power of ten; the last one is own."""
+    sums = sum(
+        apart(torch.tensor([10.0**rank, 1.0]), plays_own(CONFIG, rank, 3)) for rank in range(3)
+    )
+    assert isinstance(sums, torch.Tensor) and sums.tolist() == [11.0, 2.0, 100.0, 1.0]
 
 
 def test_mistakes_are_sentences(capsys, tmp_path):

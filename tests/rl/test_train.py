@@ -352,9 +352,10 @@ def test_like_drake_is_short_for_worlds_with_feet_that_stick():
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (dict(like_drake=True, vary=True), "leave --vary and --felt-damping out"),
-        (dict(like_drake=True, felt_damping=True), "leave --vary and --felt-damping out"),
-        (dict(variation=OWN, like_drake=True), "give --vary as well"),
+        (dict(like_drake=True, vary=True), "leave --vary, the --variation options and"),
+        (dict(like_drake=True, felt_damping=True), "and --felt-damping out"),
+        (dict(variation=OWN, like_drake=True), "leave --vary, the --variation options and"),
+        (dict(engine="drake", timestep_divisor=2), "drake has time steps of its own"),
         (dict(engine="drake", vary=True), "drake has worlds of its own"),
         (dict(engine="drake", like_drake=True), "drake has worlds of its own"),
         (dict(engine="drake", felt_damping=True), "always feel the joints' damping in drake"),
