@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rl.runlog import KINDS
 from warmstart.atomic import write_json
 
 POINTS = 40
@@ -22,7 +23,7 @@ DIGITS = 6
 """Of every number that is not whole: more are noise, and most of the file."""
 KEPT = ("samples", "minutes", "return", "episode_steps", "samples_per_s", "nan_worlds", "overflow")
 KEPT += ("middle", "candidates")
-GROUPS = ("metrics/", "own/", "others/", "curriculum/")
+GROUPS = ("metrics/", *(f"{kind}/" for kind in KINDS), "curriculum/")
 ORIGIN = ("task", "algo", "strength", "limits", "commit", "hardware", "versions", "config")
 
 

@@ -78,10 +78,10 @@ class EpisodeMeter:
             out[f"terms/{name}"] = totals[at + k] / max(steps, 1.0)
         return out
 
-    def metrics(self, totals: list[float], prefix: str) -> dict[str, float | int | None]:
-        """Those of ``summary`` that are metrics, under other names."""
+    def metrics(self, totals: list[float], kind: str) -> dict[str, float | int | None]:
+        """Those of ``summary`` that are metrics, as columns of a kind of ranks."""
         found = self.summary(totals)
-        return {f"{prefix}{name}": found[f"metrics/{name}"] for name in self._metrics}
+        return {f"{kind}/{name}": found[f"metrics/{name}"] for name in self._metrics}
 
     def state_dict(self) -> dict[str, Tensor]:
         """Running episodes' returns and lengths."""

@@ -12,6 +12,8 @@ from typing import Any
 from warmstart.atomic import write_text
 
 Row = dict[str, float | int | None]
+KINDS = ("own", "others")
+"""Of ranks, with ``own_ranks``: a metric has a column of each, ``own/success``."""
 
 
 class RunLog:
@@ -129,7 +131,7 @@ def _line(row: Row, share: float) -> str:
     words = [f"{share:4.0%}", f"iteration {row['iteration']}"]
     words += [f"{name} {_text(row[name])}" for name in _SHOWN if name in row]
     words += [f"{k[8:]} {_text(v)}" for k, v in row.items() if k.startswith("metrics/")]
-    kinds = ("own/", "others/")
+    kinds = tuple(f"{kind}/" for kind in KINDS)
     words += [f"{k.replace('/', ' ')} {_text(v)}" for k, v in row.items() if k.startswith(kinds)]
     return " | ".join(words)
 
@@ -147,7 +149,7 @@ def _panel(row: Row, share: float) -> Any:
         return grid
 
     groups = [table("learning", [*_SHOWN, "explained_variance", "episodes"])]
-    for section in ("metrics", "own", "others", "terms", "curriculum"):
+    for section in ("metrics", *KINDS, "terms", "curriculum"):
         names = [k for k in row if k.startswith(section + "/")]
         if names:
             groups.append(table(section, names))

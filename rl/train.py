@@ -30,7 +30,7 @@ from rl.ranks import over_ranks
 from rl.rate_watch import RateWatch
 from rl.rollout import collect
 from rl.run_folder import Progress, restore, save, settle, write_config
-from rl.runlog import Row, RunLog
+from rl.runlog import KINDS, Row, RunLog
 from sports.env import Starts
 
 __all__ = ["RunSummary", "TrainConfig", "load_starts", "main", "parse_args", "train"]
@@ -355,7 +355,9 @@ class _Trainer:
         half = len(totals) // 2
         others, own = totals[:half], totals[half:]
         told = meter.summary([a + b for a, b in zip(others, own)])
-        return told | meter.metrics(own, "own/") | meter.metrics(others, "others/")
+        for kind, sums in zip(KINDS, (own, others)):
+            told |= meter.metrics(sums, kind)
+        return told
 
     def _number(self, x: Tensor | int) -> Tensor:
         """(1,) float64 on the learner's device."""

@@ -8,7 +8,6 @@ clip in its task's environment, where the task's own rules measure what it achie
 from __future__ import annotations
 
 import math
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -115,17 +114,7 @@ def _corrections(solution: Solution) -> _Correct | None:
     """Torques beyond the plan (n,) by step and state; None in an open loop."""
     if not solution.stats.get(FEEDBACK):
         return None
-    from warmstart.feedback import follow
-
-    global _last
-    if _last is None or _last[0]() is not solution:
-        _last = weakref.ref(solution), follow(solution).torque
-    return _last[1]
-
-
-_last: tuple[weakref.ref[Solution], _Correct] | None = None
-"""The solution replayed last, and its feedback, which takes seconds: a certificate replays one
-motion four times, in two engines, alone and with its ball."""
+    return solution.following.torque
 
 
 def _play(

@@ -11,13 +11,17 @@ import io
 import json
 import zipfile
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sports.humanoid.body import Body, load_body
 from warmstart.atomic import write_bytes
+
+if TYPE_CHECKING:
+    from warmstart.feedback import Feedback
 
 _ARRAYS = {
     "times": 1,
@@ -86,6 +90,15 @@ class Solution:
     def duration(self) -> float:
         """Seconds from the first to the last knot."""
         return float(self.times[-1] - self.times[0])
+
+    @cached_property
+    def following(self) -> Feedback:
+        """The feedback that holds a simulation on this motion. It takes seconds, and a certificate
+        replays a motion several times. Raises ValueError where :func:`warmstart.feedback.follow`
+        does."""
+        from warmstart.feedback import follow
+
+        return follow(self)
 
     def loaded(self, times: np.ndarray) -> np.ndarray:
         """(T,) share of what is thrown that is in the hand: 1, then 0; 1 for ever without a throw.
