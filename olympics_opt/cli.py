@@ -87,6 +87,11 @@ class Export:
     ``RUN@SAMPLES``; or a policy file."""
     out: Path
     """The policy file, FILE.safetensors; the card is FILE.json beside it."""
+    mean: tuple[Path, ...] = ()
+    """Other runs or policy files of the same kind, with whose weights RUN's are averaged: states
+    of one run (``train --keep-policies``) or runs that began alike. Often better than each."""
+    shares: tuple[float, ...] = ()
+    """In the mean, of RUN and of each of ``--mean``, of any sum; by default all alike."""
     critic: bool = False
     """Keep the critic too, so that fine-tuning (``train --init``) need not begin without one."""
     precision: Literal["float16", "int8"] = "float16"

@@ -268,12 +268,17 @@ def run_train(args: list[str]) -> int:
 def run_export(config: Export) -> int:
     """The command. Raises ValueError for a run or a result that cannot be used, OSError where the
     file cannot be written."""
-    from rl.policy import export_policy
+    from rl.averaging import mean_policy
+    from rl.policy import export_policy, read_policy
 
-    if not Path(str(config.run).partition("@")[0]).exists():
-        raise ValueError(
-            f"there is no run '{config.run}': give the folder that `train` wrote, or a policy file"
-        )
+    runs = (config.run, *config.mean)
+    for run in runs:
+        if not Path(str(run).partition("@")[0]).exists():
+            raise ValueError(
+                f"there is no run '{run}': give the folder that `train` wrote, or a policy file"
+            )
+    if config.shares and not config.mean:
+        raise ValueError("--shares are those of a mean: give the other policies with --mean")
     if config.out.suffix != ".safetensors":
         raise ValueError(f"{config.out} must end in .safetensors")
     metrics, of = None, ""
@@ -281,7 +286,9 @@ def run_export(config: Export) -> int:
         metrics, of = _measured(config.result)
     atomic.prepare(config.out)
     path = export_policy(
-        config.run,
+        mean_policy([read_policy(run, "") for run in runs], config.shares or None)
+        if config.mean
+        else config.run,
         config.out,
         metrics=metrics,
         metrics_of=of,

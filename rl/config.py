@@ -147,6 +147,10 @@ class TrainConfig:
     """A checkpoint at least this often."""
     checkpoint_iterations: int | None = None
     """And after every so many iterations."""
+    keep_policies: bool = False
+    """Keep the policy of every checkpoint, with its critic, as RUN/policies/SAMPLES.safetensors: an
+    earlier one may be the best in another engine, and the mean of several (``export --mean``) is
+    often better than each."""
     cuda_graph: bool = True
     """Replay the update as a CUDA graph where that is possible."""
     quiet: bool = False
@@ -247,6 +251,8 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
         yield f"the task '{c.task}' comes before a latent prior: leave it out"
     if c.task not in ("", PRIOR) and c.tracker is not None:
         yield "--tracker is for the task 'prior' alone"
+    if c.keep_policies and c.task in (PRIOR, BALANCE):
+        yield f"'{c.task}' makes a latent prior, not policies: leave --keep-policies out"
     if c.task == PRIOR and (c.algo != "ppo" or c.ppo != PPOConfig() or c.paper):
         yield "the task 'prior' has a learner of its own: its options are --task.*"
 

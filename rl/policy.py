@@ -38,6 +38,8 @@ BASELINES = ("zero", "random")
 ALGORITHMS = ("ppo", "amp", "selfplay", "latent", "latent-amp", "latent-selfplay")
 """Those whose actor turns an observation into PD targets, which is what a policy is here, or into
 latents of a prior (``latent``), which it is told of by its card."""
+KEPT = "policies"
+"""Folder in a run's of the policies of its checkpoints (``train --keep-policies``)."""
 MAX_WIDTH, MAX_LAYERS = 1 << 16, 32
 _REQUIRED = {
     "format": str,
@@ -328,19 +330,20 @@ def _from_file(path: Path) -> Policy:
     actor = {k: v.float() for k, v in weights.items() if k not in extra}
     policy = _build(card, actor, str(path))
     policy.extra = {k: v.float() if k.startswith("critic.") else v for k, v in extra.items()}
-    return _with_prior(policy, path.parent)
+    run = [path.parent.parent] if path.parent.name == KEPT else []
+    return _with_prior(policy, path.parent, *run)
 
 
-def _with_prior(policy: Policy, folder: Path) -> Policy:
-    """The policy with its latent prior, from its own folder or where priors are. Raises PolicyError
-    where there is none."""
+def _with_prior(policy: Policy, *folders: Path) -> Policy:
+    """The policy with its latent prior, from its own folders or where priors are. Raises
+    PolicyError where there is none."""
     latent = policy.metadata["algo"].startswith("latent")
     card = policy.metadata.get("latent")
     if latent != isinstance(card, dict):
         raise PolicyError("the policy's card does not say through which latent prior it acts")
     if latent and card is not None:
         try:
-            policy.prior = find_prior(str(card["prior_digest"]), (folder,))
+            policy.prior = find_prior(str(card["prior_digest"]), folders)
         except (PriorError, KeyError) as error:
             raise PolicyError(str(error)) from error
     return policy
@@ -379,7 +382,7 @@ def _build(card: dict[str, Any], weights: dict[str, Tensor], where: str) -> Poli
 
 
 def export_policy(
-    run: Path | str,
+    run: Path | str | Policy,
     out: Path | str,
     *,
     metrics: dict[str, Any] | None = None,
@@ -392,8 +395,8 @@ def export_policy(
     """Writes an actor as ``OUT.safetensors`` and ``OUT.json``; returns the former.
 
     Args:
-        run: a run's folder, of which the last checkpoint is taken, ``RUN@SAMPLES``, or a policy
-            file.
+        run: a run's folder, of which the last checkpoint is taken, ``RUN@SAMPLES``, a policy
+            file, or a policy.
         out: target; any suffix becomes ``.safetensors``.
         metrics: an evaluation's metrics for the card; the run's last ones if None.
         metrics_of: sha256 of the policy that was evaluated, where it is known: it must be the
@@ -407,16 +410,17 @@ def export_policy(
     Raises PolicyError when there is no readable checkpoint or policy, when its weights do not fit
     fp16, and for metrics of another policy.
     """
-    policy = read_policy(run, "")
+    policy = run if isinstance(run, Policy) else read_policy(run, "")
+    name = policy.metadata["task"] if isinstance(run, Policy) else run
     if policy.actor is None:
-        raise PolicyError(f"'{run}' is a baseline: it has no weights to export")
+        raise PolicyError(f"'{name}' is a baseline: it has no weights to export")
     weights = dict(policy.actor.state_dict())
     if critic:
         weights |= policy.extra
     try:
         kept = _halves(weights)
     except ValueError as error:
-        raise PolicyError(f"the weights of run '{run}' {error}") from None
+        raise PolicyError(f"the weights of run '{name}' {error}") from None
     if precision == "int8":
         kept = packed(kept)
         if observed is not None:
@@ -426,7 +430,7 @@ def export_policy(
     if metrics_of and metrics_of not in (policy.metadata["sha256"], digest):
         raise PolicyError(
             f"the metrics are of another policy ({metrics_of[:12]}...) than the last checkpoint "
-            f"of '{run}': evaluate that one"
+            f"of '{name}': evaluate that one"
         )
     card: dict[str, Any] = {**policy.metadata, "precision": precision}
     if metrics is not None:

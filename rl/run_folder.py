@@ -20,11 +20,13 @@ from rl.assembly import Assembly
 from rl.checkpoint import checkpoints, load_checkpoint, ranks_of, read_state, save_checkpoint
 from rl.config import APART, TrainConfig, config_from_dict, task_options
 from rl.policy import FORMAT as POLICY_FORMAT
+from rl.policy import KEPT, export_policy
 from sports.registry import task_names
 from warmstart.atomic import write_text
 
 FREE = {"out", "resume", "samples", "minutes", "quiet", "checkpoint_minutes"}
-FREE |= {"checkpoint_iterations", "device", "cuda_graph", "physics_options", "profile"}
+FREE |= {"checkpoint_iterations", "keep_policies", "device", "cuda_graph", "physics_options"}
+FREE |= {"profile"}
 """What a resumed run may change; everything else is the run's own."""
 NOISY = ("agent", "env", "style", "selfplay")
 """What has noise of its own. A place in this list decides a seed: append only."""
@@ -173,6 +175,12 @@ def save(made: Assembly, now: Progress) -> Path:
     state |= {part.name: own for part in made.parts if (own := part.state())}
     barrier = dist.barrier if made.ranks > 1 else None
     return save_checkpoint(made.config.out, now.iteration, state, tensors, made.rank, barrier)
+
+
+def keep_policy(made: Assembly, now: Progress) -> Path:
+    """The policy of the last checkpoint as a file of its own, to choose from or to average."""
+    out = made.config.out
+    return export_policy(out, out / KEPT / f"{now.samples:012d}", critic=True)
 
 
 def restore(made: Assembly) -> Progress:

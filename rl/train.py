@@ -29,7 +29,7 @@ from rl.profiling import profile_training
 from rl.ranks import over_ranks
 from rl.rate_watch import RateWatch
 from rl.rollout import collect
-from rl.run_folder import Progress, restore, save, settle, write_config
+from rl.run_folder import Progress, keep_policy, restore, save, settle, write_config
 from rl.runlog import KINDS, Row, RunLog
 from sports.env import Starts
 
@@ -144,10 +144,10 @@ class _Trainer:
                             print(f"warning: {advice}", file=sys.stderr, flush=True)
                         if self.on_iteration is not None:
                             self.on_iteration(row)
-                    saved = save(self.made, self.now) if self._save_due(saved_at) else None
+                    saved = self._save() if self._save_due(saved_at) else None
                     if saved is not None:
                         saved_at = self.now.minutes
-                saved = saved or save(self.made, self.now)
+                saved = saved or self._save()
                 if config.task == PRIOR and self.rank == 0:
                     latent_run.write_prior(config.out)
         except OSError as error:
@@ -197,6 +197,13 @@ class _Trainer:
         if every is not None and self.now.iteration % every == 0:
             return True
         return self.now.minutes - saved_at >= self.config.checkpoint_minutes
+
+    def _save(self) -> Path:
+        """Writes a checkpoint, and the policy in it where those are to be kept."""
+        path = save(self.made, self.now)
+        if self.config.keep_policies and self.rank == 0:
+            keep_policy(self.made, self.now)
+        return path
 
     def _summary(self, stopped_by: str, path: Path) -> RunSummary:
         return RunSummary(

@@ -334,6 +334,31 @@ def test_an_exported_policy_plays_like_its_run(tmp_path: Path, capsys):
     assert "metrics are of another policy" in capsys.readouterr().err
 
 
+def test_an_export_may_be_the_mean_of_several(tmp_path: Path, capsys):
+    from rl.policy import load_policy
+
+    run, out = tmp_path / "run", tmp_path / "mean.safetensors"
+    finer_policy(tmp_path, keep_policies=True, checkpoint_iterations=1)
+    kept = sorted((run / "policies").glob("*.safetensors"))
+    assert [path.stem for path in kept] == ["000000000008"]
+    line = f"export {run} --mean {kept[0]} --shares 1 3 --out {out}"
+    assert cli.main(line.split()) == 0
+    assert f"wrote {out}" in capsys.readouterr().out
+    obs = torch.randn(20, 1, load_policy(run, "long_jump").metadata["obs_size"])
+    mean, whole = load_policy(out, "long_jump"), load_policy(run, "long_jump")
+    torch.testing.assert_close(mean(obs), whole(obs), atol=5e-3, rtol=5e-3)
+    assert [part["share"] for part in mean.metadata["averaged"]] == [0.25, 0.75]
+    for wrong, told in (
+        (f"--mean {tmp_path / 'nothing'}", "there is no run"),
+        ("--shares 1", "give the other policies with --mean"),
+        (f"--mean {kept[0]} --shares 1", "2 policies need as many shares, not 1"),
+        (f"--mean {tmp_path}", "has no checkpoint yet"),
+    ):
+        line = f"export {run} {wrong} --out {tmp_path / 'x.safetensors'}"
+        assert told in sentence_of(capsys, *line.split())
+        assert not (tmp_path / "x.safetensors").exists()
+
+
 def test_an_export_in_int8_plays_its_task_unless_asked_not_to(tmp_path: Path, capsys, monkeypatch):
     from rl import calibration
 

@@ -151,6 +151,8 @@ def test_mistakes_are_told(folder, tmp_path):
         run_config(folder, algo="amp")
     with pytest.raises(ValueError, match=r"leave --ppo\.sigma out"):
         run_config(folder, ppo=replace(SMALL, sigma=0.3))
+    with pytest.raises(ValueError, match="leave --keep-policies out"):
+        run_config(folder, keep_policies=True)
     with pytest.raises(ValueError, match="seconds"):
         BalanceConfig(seconds=0.0)
     with pytest.raises(PriorError, match="learned to balance already"):

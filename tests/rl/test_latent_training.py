@@ -353,8 +353,10 @@ def test_two_sides_play_through_one_prior(folder, tmp_path):
 
 
 def test_an_evaluation_is_stepping_by_hand(folder, tmp_path, monkeypatch):
-    train(task_config(folder, tmp_path / "run"))
+    train(replace(task_config(folder, tmp_path / "run"), keep_policies=True))
     path = export_policy(tmp_path / "run", tmp_path / "shipped" / "kick")
+    kept = list((tmp_path / "run" / "policies").glob("*.safetensors"))
+    assert load_policy(kept[-1], "penalty_kick").prior is not None  # of the run above it
     assert path.stat().st_size < 40_000  # the prior is not in it
     card = json.loads(path.with_suffix(".json").read_text())
     assert card["algo"] == "latent" and card["config"]["prior"] == "prior.safetensors"
