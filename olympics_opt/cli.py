@@ -89,7 +89,8 @@ class Export:
     """The policy file, FILE.safetensors; the card is FILE.json beside it."""
     mean: tuple[Path, ...] = ()
     """Other runs or policy files of the same kind, with whose weights RUN's are averaged: states
-    of one run (``train --keep-policies``) or runs that began alike. Often better than each."""
+    of one run (``RUN/policies/*.safetensors`` of ``train --keep-policies``) or runs that began
+    alike. Often better than each."""
     shares: tuple[float, ...] = ()
     """In the mean, of RUN and of each of ``--mean``, of any sum; by default all alike."""
     critic: bool = False

@@ -46,14 +46,20 @@ def mean_policy(policies: Sequence[Policy], shares: Sequence[float] | None = Non
     observation begins. The critics' mean comes along where all have one.
 
     Args:
-        policies: two or more.
+        policies: two or more. A state that comes twice, as a run's last one does beside the files
+            of ``--keep-policies``, counts once where no shares are given.
         shares: of each, not negative, of any sum above 0; equal if None.
 
     Raises PolicyError where the policies have not the same task, body and networks, and ValueError
     for shares that cannot be.
     """
+    if shares is None:
+        once: dict[tuple[object, ...], Policy] = {}
+        for policy in policies:
+            once.setdefault(_state(policy), policy)
+        policies = list(once.values())
     if len(policies) < 2:
-        raise ValueError("a mean takes two policies or more")
+        raise ValueError("a mean takes two policies or more that differ")
     wanted = [1.0] * len(policies) if shares is None else [float(share) for share in shares]
     if len(wanted) != len(policies):
         raise ValueError(f"{len(policies)} policies need as many shares, not {len(wanted)}")
@@ -84,6 +90,12 @@ def mean_policy(policies: Sequence[Policy], shares: Sequence[float] | None = Non
         critics = [_read_as(p.extra, "critic.", p, first) for p in policies]
         extra = _mean(critics, parts)
     return Policy(network, first.mean, first.std, card, extra, first.prior)
+
+
+def _state(policy: Policy) -> tuple[object, ...]:
+    """What tells one state of one run from all others: how far it is, to the last digit."""
+    card = policy.metadata
+    return (card.get("samples"), card.get("minutes")) if card.get("minutes") else (card["sha256"],)
 
 
 def _shapes(policy: Policy) -> dict[str, torch.Size]:

@@ -79,7 +79,7 @@ def test_of_one_policy_it_is_that_policy_whatever_statistics_a_copy_reads_by(kep
     obs = 0.2 * torch.randn(100, 1, 2) + own.mean  # where nothing is clipped
     torch.testing.assert_close(other(obs), own(obs), atol=1e-5, rtol=1e-5)
     for policies in ((own, other), (other, own)):
-        mean = mean_policy(policies)
+        mean = mean_policy(policies, (1.0, 2.0))
         torch.testing.assert_close(mean(obs), own(obs), atol=1e-5, rtol=1e-5)
         torch.testing.assert_close(mean.mean, policies[0].mean)
         for name in ("critic.trunk.0.weight", "critic.trunk.0.bias"):
@@ -118,6 +118,20 @@ def test_shares_that_cannot_be_are_refused(kept, shares, told):
         mean_policy(policies, shares)
     with pytest.raises(ValueError, match="two policies or more"):
         mean_policy(policies[:1])
+
+
+def test_a_state_that_comes_twice_counts_once_unless_shares_say_otherwise(kept):
+    """The run's own last state is that of its last file; which comes first gives the card."""
+    last = read_policy(kept[0].parent.parent, "")
+    files = [read_policy(path, "") for path in kept]
+    mean = mean_policy([last, *files])
+    counted = [(a["samples"], a["share"]) for a in mean.metadata["averaged"]]
+    assert counted == [(4096, 0.25), (1024, 0.25), (2048, 0.25), (3072, 0.25)]
+    assert mean.metadata["averaged"][0]["sha256"] == last.metadata["sha256"]
+    heavy = mean_policy([last, files[-1], files[0]], (1.0, 1.0, 2.0))
+    assert [a["share"] for a in heavy.metadata["averaged"]] == [0.25, 0.25, 0.5]
+    with pytest.raises(ValueError, match="that differ"):
+        mean_policy([last, files[-1]])
 
 
 def renormed(path: Path, like: Path, out: Path) -> Path:
