@@ -8,7 +8,9 @@ are near each other, not for two that learned apart from the beginning.
 
 from __future__ import annotations
 
+import copy
 import hashlib
+import json
 import math
 from collections.abc import Sequence
 
@@ -16,26 +18,11 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from rl.networks import MLP
+from rl.directions import Directions, Weights, read_as, towards, weights_of
 from rl.policy import Policy, PolicyError
 
-ALIKE = (
-    "task",
-    "algo",
-    "body",
-    "strength",
-    "limits",
-    "obs_size",
-    "obs_layout",
-    "action_size",
-    "hidden",
-    "activation",
-    "observation_clip",
-    "latent",
-)
-"""What the cards of policies must agree about."""
-_FIRST = "trunk.0"
-"""The layer that reads the observation."""
+ALIKE = ("task", "algo", "body", "strength", "limits", "obs_layout", "hidden")
+"""What the cards of policies must agree about, beside what ``rl.directions.towards`` asks for."""
 
 
 def mean_policy(policies: Sequence[Policy], shares: Sequence[float] | None = None) -> Policy:
@@ -54,7 +41,7 @@ def mean_policy(policies: Sequence[Policy], shares: Sequence[float] | None = Non
     for shares that cannot be.
     """
     if shares is None:
-        once: dict[tuple[object, ...], Policy] = {}
+        once: dict[str, Policy] = {}
         for policy in policies:
             once.setdefault(_state(policy), policy)
         policies = list(once.values())
@@ -66,11 +53,12 @@ def mean_policy(policies: Sequence[Policy], shares: Sequence[float] | None = Non
     if not all(math.isfinite(share) and share >= 0.0 for share in wanted) or sum(wanted) <= 0.0:
         raise ValueError(f"shares must not be negative, and not all 0: {tuple(wanted)}")
     parts = [share / sum(wanted) for share in wanted]
-    first = policies[0]
-    for other in policies:
+    first, *others = policies
+    base = weights_of(first)
+    for other in others:
         _same_kind(first, other)
-    actors = [_read_as(_actor(p).state_dict(), "", p, first) for p in policies]
-    actor = _mean(actors, parts)
+    ways = Directions(base, [towards(first, other) for other in others])
+    weights = ways.at(torch.tensor(parts[1:], dtype=torch.float64))
     card = {
         **first.metadata,
         "metrics": {},
@@ -78,40 +66,25 @@ def mean_policy(policies: Sequence[Policy], shares: Sequence[float] | None = Non
             {"sha256": p.metadata["sha256"], "samples": p.metadata.get("samples"), "share": part}
             for p, part in zip(policies, parts)
         ],
-        "sha256": hashlib.sha256(save(actor)).hexdigest(),
+        "sha256": hashlib.sha256(save(weights)).hexdigest(),
     }
     card.pop("looks", None)
-    sizes = [card["obs_size"], *card["hidden"], card["action_size"]]
-    network = MLP(sizes[0], sizes[1:-1], sizes[-1], card["activation"])
-    network.load_state_dict(actor)
-    network.requires_grad_(False)
-    extra: dict[str, Tensor] = {}
-    if all({k: v.shape for k, v in p.extra.items()} == _shapes(first) for p in policies):
-        critics = [_read_as(p.extra, "critic.", p, first) for p in policies]
-        extra = _mean(critics, parts)
-    return Policy(network, first.mean, first.std, card, extra, first.prior)
+    assert first.actor is not None
+    actor = copy.deepcopy(first.actor)
+    actor.load_state_dict(weights)
+    return Policy(actor, first.mean, first.std, card, _mean_critic(policies, parts), first.prior)
 
 
-def _state(policy: Policy) -> tuple[object, ...]:
-    """What tells one state of one run from all others: how far it is, to the last digit."""
+def _state(policy: Policy) -> str:
+    """What a state of one run keeps when it is exported, and no other has."""
     card = policy.metadata
-    return (card.get("samples"), card.get("minutes")) if card.get("minutes") else (card["sha256"],)
-
-
-def _shapes(policy: Policy) -> dict[str, torch.Size]:
-    return {k: v.shape for k, v in policy.extra.items()}
-
-
-def _actor(policy: Policy) -> MLP:
-    if policy.actor is None:
-        raise PolicyError(f"'{policy.metadata['algo']}' is a baseline: it has no weights")
-    return policy.actor
+    told = [card.get(name) for name in ("samples", "minutes", "polish", "averaged")]
+    return json.dumps(told if card.get("minutes") else card["sha256"])
 
 
 def _same_kind(first: Policy, other: Policy) -> None:
     """Raises PolicyError where two policies' weights do not mean the same."""
-    for policy in (first, other):
-        _actor(policy)
+    weights_of(other)  # a baseline has none
     for name in ALIKE:
         one, two = first.metadata.get(name), other.metadata.get(name)
         if one != two:
@@ -121,29 +94,15 @@ def _same_kind(first: Policy, other: Policy) -> None:
             )
 
 
-def _read_as(
-    weights: dict[str, Tensor], prefix: str, own: Policy, first: Policy
-) -> dict[str, Tensor]:
-    """Weights of a network that reads observations by ``own``'s statistics, for the same function
-    of those by ``first``'s: (x - m) / s = ((x - m') / s') * (s' / s) + (m' - m) / s."""
-    w, b = f"{prefix}{_FIRST}.weight", f"{prefix}{_FIRST}.bias"
-    if w not in weights:
-        return dict(weights)
-    scale = (first.std.double() / own.std.double())[None, :]
-    shift = (first.mean.double() - own.mean.double()) / own.std.double()
-    matrix = weights[w].double()
-    return {**weights, w: matrix * scale, b: weights[b].double() + matrix @ shift}
-
-
-def _mean(networks: Sequence[dict[str, Tensor]], parts: Sequence[float]) -> dict[str, Tensor]:
-    """Each number's mean, in the type that the first network's has; what is no number is its."""
-    mean = {}
-    for name, value in networks[0].items():
-        if value.dtype == torch.bool:
-            mean[name] = value
-            continue
-        total = sum(part * n[name].double() for n, part in zip(networks, parts))
-        assert isinstance(total, Tensor)
-        kind = torch.float64 if name.startswith("value_norm.") else torch.float32
-        mean[name] = total.to(kind).contiguous()
+def _mean_critic(policies: Sequence[Policy], parts: Sequence[float]) -> dict[str, Tensor]:
+    """Of the critics and their statistics; nothing where one is missing or another network."""
+    first = policies[0]
+    fits = {k: v.shape for k, v in first.extra.items()}
+    if not fits or any({k: v.shape for k, v in p.extra.items()} != fits for p in policies):
+        return {}
+    critics: list[Weights] = [read_as(first, p, p.extra, "critic.") for p in policies]
+    mean = dict(critics[0])
+    for name, value in mean.items():
+        if value.is_floating_point():  # else what says which features stay as they are
+            mean[name] = sum((part * c[name] for part, c in zip(parts, critics)), 0.0 * value)
     return mean

@@ -36,7 +36,7 @@ class Directions:
 def weights_of(policy: Policy) -> Weights:
     """The actor's weights. Raises PolicyError for a baseline, which has none."""
     if policy.actor is None:
-        raise PolicyError("a baseline has no weights that could be changed")
+        raise PolicyError(f"'{policy.metadata['algo']}' is a baseline: it has no weights to change")
     return {name: x.detach().clone() for name, x in policy.actor.state_dict().items()}
 
 
@@ -54,13 +54,20 @@ def towards(policy: Policy, other: Policy) -> Weights:
         raise PolicyError(
             "only policies with networks, clipping and latents of one kind can be mixed"
         )
-    first = "trunk.0"
-    weight = goal[f"{first}.weight"]
-    goal[f"{first}.bias"] = goal[f"{first}.bias"] + weight @ (
-        (policy.mean - other.mean) / other.std
-    )
-    goal[f"{first}.weight"] = weight * (policy.std / other.std)
+    goal = read_as(policy, other, goal)
     return {name: goal[name] - base[name] for name in base}
+
+
+def read_as(policy: Policy, other: Policy, weights: Weights, prefix: str = "") -> Weights:
+    """Weights of a network of ``other``'s, whose names begin with ``prefix``, for the same function
+    of observations that are normalised as ``policy``'s are. Exact where neither clips."""
+    first = f"{prefix}trunk.0"
+    weight, bias = weights[f"{first}.weight"], weights[f"{first}.bias"]
+    return {
+        **weights,
+        f"{first}.weight": weight * (policy.std / other.std),
+        f"{first}.bias": bias + weight @ ((policy.mean - other.mean) / other.std),
+    }
 
 
 def scaled(change: Mapping[str, Tensor], unit: float) -> Weights:

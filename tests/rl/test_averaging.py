@@ -132,6 +132,8 @@ def test_a_state_that_comes_twice_counts_once_unless_shares_say_otherwise(kept):
     assert [a["share"] for a in heavy.metadata["averaged"]] == [0.25, 0.25, 0.5]
     with pytest.raises(ValueError, match="that differ"):
         mean_policy([last, files[-1]])
+    polished = dataclasses.replace(last, metadata={**last.metadata, "polish": {"of": "it"}})
+    assert len(mean_policy([last, polished]).metadata["averaged"]) == 2  # of as many samples
 
 
 def renormed(path: Path, like: Path, out: Path) -> Path:
