@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -264,15 +264,18 @@ def _from_run(run: Path) -> Policy:
         card = dict(state["card"])
     except (CheckpointError, KeyError, TypeError, ValueError) as error:
         raise PolicyError(f"the run '{run}' cannot be used: {error}") from error
-    weights = {k.removeprefix("agent/actor."): v for k, v in tensors.items() if "/actor." in k}
+    agent = {k.removeprefix("agent/"): v for k, v in tensors.items() if k.startswith("agent/")}
+    return _with_prior(learned(card, agent, str(run)), run)
+
+
+def learned(card: dict[str, Any], agent: Mapping[str, Tensor], where: str) -> Policy:
+    """The policy in a learner's state, on the CPU, with its critic; without the latent prior that
+    it may need to play. Raises PolicyError naming what is wrong with the card."""
+    weights = {k.removeprefix("actor."): v for k, v in agent.items() if k.startswith("actor.")}
     digest = hashlib.sha256(save(weights)).hexdigest()
-    policy = _build({**card, "sha256": digest}, weights, str(run))
-    policy.extra = {
-        k.removeprefix("agent/"): v
-        for k, v in tensors.items()
-        if k.startswith(("agent/critic.", "agent/value_norm."))
-    }
-    return _with_prior(policy, run)
+    policy = _build({**card, "sha256": digest}, weights, where)
+    policy.extra = {k: v for k, v in agent.items() if k.startswith(("critic.", "value_norm."))}
+    return policy
 
 
 def _from_pool(run: Path, which: str) -> Policy:

@@ -20,7 +20,7 @@ from rl.assembly import Assembly
 from rl.checkpoint import checkpoints, load_checkpoint, ranks_of, read_state, save_checkpoint
 from rl.config import APART, TrainConfig, config_from_dict, task_options
 from rl.policy import FORMAT as POLICY_FORMAT
-from rl.policy import KEPT, export_policy
+from rl.policy import KEPT, export_policy, learned
 from sports.registry import task_names
 from warmstart.atomic import write_text
 
@@ -178,9 +178,11 @@ def save(made: Assembly, now: Progress) -> Path:
 
 
 def keep_policy(made: Assembly, now: Progress) -> Path:
-    """The policy of the last checkpoint as a file of its own, to choose from or to average."""
+    """The policy as it is now as a file of its own, to choose from or to average."""
     out = made.config.out
-    return export_policy(out, out / KEPT / f"{now.samples:012d}", critic=True)
+    agent = {name: x.cpu() for name, x in made.agent.state_dict().items()}
+    policy = learned(policy_card(made, now), agent, str(out))
+    return export_policy(policy, out / KEPT / f"{now.samples:012d}", critic=True)
 
 
 def restore(made: Assembly) -> Progress:
