@@ -70,12 +70,13 @@ class Stopwatch:
         return [b - a for a, b in pairs]
 
 
-def join_ranks(device: str = "auto") -> bool:
+def join_ranks(device: str = "auto", share: bool = False) -> bool:
     """Joins the process group that torchrun has prepared, if any; whether it did.
 
     With GPUs, each process takes the one of its local rank as the current device, and the ranks
-    talk through NCCL; with ``device`` ``cpu``, or none, through gloo. Raises ValueError where the
-    processes are more than the GPUs, or ``device`` names one for all.
+    talk through NCCL; with ``device`` ``cpu``, or none, through gloo. With ``share`` processes
+    that are more than the GPUs take them in turn and talk through gloo as well: NCCL wants a GPU
+    for each. Raises ValueError where they are more without it, or ``device`` names one for all.
     """
     ranks = int(os.environ.get("WORLD_SIZE", "1"))
     if ranks == 1 or dist.is_initialized():
@@ -89,14 +90,17 @@ def join_ranks(device: str = "auto") -> bool:
             f"--device {device} names one GPU for {ranks} processes: leave it out, and each takes "
             "its own"
         )
-    if here > gpus:
+    if here > gpus and not share:
         raise ValueError(
             f"{here} processes need {here} GPUs, and this machine has {gpus}: give torchrun "
             f"--nproc-per-node {gpus}, or train on the processor with --device cpu"
         )
-    own = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+    own = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")) % gpus)
     torch.cuda.set_device(own)
-    dist.init_process_group("nccl", device_id=own)
+    if here > gpus:
+        dist.init_process_group("gloo")
+    else:
+        dist.init_process_group("nccl", device_id=own)
     return True
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
+
+from rl.ranks import gathered
 
 
 class Normalizer:
@@ -59,13 +60,8 @@ class Normalizer:
 
     def commit(self) -> None:
         """Merges the pending moments of every rank into the statistics in use."""
-        if dist.is_initialized():
-            parts = [torch.empty_like(self._pending) for _ in range(dist.get_world_size())]
-            dist.all_gather(parts, self._pending)
-        else:
-            parts = [self._pending]
         before = self._total
-        for part in parts:
+        for part in gathered(self._pending):
             self._total = merge(self._total, part)
         self._hold(before)
         self._pending = torch.zeros_like(self._pending)
@@ -90,13 +86,10 @@ class Normalizer:
         """Gives some features (D,) bool, of which nothing is known yet, the moments that are now
         pending in all ranks, as if every sample in use had shown them. Call it before ``commit``.
         """
-        seen = self._pending
-        if dist.is_initialized():
-            parts = [torch.empty_like(seen) for _ in range(dist.get_world_size())]
-            dist.all_gather(parts, seen)
-            seen = parts[0]
-            for part in parts[1:]:
-                seen = merge(seen, part)
+        parts = gathered(self._pending)
+        seen = parts[0]
+        for part in parts[1:]:
+            seen = merge(seen, part)
         count, mean, squares = _split(self._total)
         shown, new_mean, new_squares = _split(seen)
         new_squares = new_squares * (count / shown.clamp(min=1.0))

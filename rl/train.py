@@ -83,7 +83,7 @@ def train(
     Raises ValueError for settings that cannot be, PolicyError for ``init``, CheckpointError when
     a checkpoint cannot be written or read, RuntimeError for an engine that cannot run here.
     """
-    began_group = join_ranks(config.device)
+    began_group = join_ranks(config.device, share=config.own_ranks > 0)
     try:
         made = assemble(settle(config), starts, environment)
         trainer = _Trainer(made, on_iteration)

@@ -1,4 +1,5 @@
-"""Run by torchrun in test_distributed_gpu.py: captured and plain updates of two GPUs."""
+"""Run by torchrun in test_distributed_gpu.py: captured and plain updates of two processes, and what
+each says of the moments of both."""
 
 from __future__ import annotations
 
@@ -10,12 +11,14 @@ import torch.distributed as dist
 from safetensors.torch import save_file
 
 from rl.host import join_ranks
+from rl.normalizer import Normalizer
 from rl.ppo import PPO, PPOConfig
 from tests.rl.test_gpu import fill
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1])
-    join_ranks()
+    join_ranks(share=True)
+    apart = torch.cuda.device_count() >= dist.get_world_size()
     rank = dist.get_rank()
     device = torch.device("cuda", torch.cuda.current_device())
     config = PPOConfig(hidden=(64, 32), steps=8, minibatches=4, epochs=3)
@@ -30,9 +33,13 @@ if __name__ == "__main__":
         kind = "captured" if graph else "plain"
         state = {k: v for k, v in agent.state_dict().items() if k != "generator"}
         found |= {f"{kind}/{k}": v.clone().cpu() for k, v in state.items()}
-        if graph:
+        if graph and apart:  # gloo waits for the device
             torch.cuda.set_sync_debug_mode("error")
             agent.update(rollout)
             torch.cuda.set_sync_debug_mode("default")
+    moments = Normalizer(3, device)
+    moments.collect(torch.arange(6.0, device=device).view(2, 3) + 10.0 * rank)
+    moments.commit()
+    found |= {f"moments/{k}": v.cpu() for k, v in moments.state_dict().items()}
     save_file(found, folder / f"{rank}.safetensors")
     dist.destroy_process_group()

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import torch.distributed as dist
 from safetensors.torch import load_file
 
 from rl.checkpoint import checkpoints, load_checkpoint
@@ -169,6 +170,23 @@ def test_more_processes_than_gpus_are_refused_with_a_sentence(monkeypatch, capsy
     assert main(["long_jump", "--out", str(tmp_path / "run")]) == 2
     assert "--nproc-per-node 2" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("gpus", "rank", "own", "backend"), [(1, 1, 0, "gloo"), (2, 3, 1, "gloo"), (4, 3, 3, "nccl")]
+)
+def test_processes_that_may_share_take_gpus_in_turn(monkeypatch, gpus, rank, own, backend):
+    """As those of both worlds do: NCCL refuses two processes on one GPU."""
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    monkeypatch.setenv("LOCAL_RANK", str(rank))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    taken, groups = [], []
+    monkeypatch.setattr(torch.cuda, "set_device", taken.append)
+    monkeypatch.setattr(dist, "init_process_group", lambda kind, **_: groups.append(kind))
+    assert join_ranks(share=True)
+    assert taken == [torch.device("cuda", own)] and groups == [backend]
 
 
 def test_trackers_of_two_ranks_learn_from_each_others_failures(tmp_path):
