@@ -33,9 +33,8 @@ from rl.ppo import PPO, STATISTICS
 from rl.ranks import own_rank
 from rl.rollout import Actor, Rollout
 from rl.warm_start import load_start
-from rl.worlds import engine_options
+from rl.worlds import engine_options, in_own_worlds
 from sports.env import Env, Starts, make_env
-from sports.variation import Variation
 
 MakeEnv = Callable[[TrainConfig, int], Any]
 """(config, seed) -> environment."""
@@ -173,15 +172,7 @@ def of_rank(config: TrainConfig, rank: int, ranks: int) -> TrainConfig:
         )
     if not plays_own(config, rank, ranks):
         return config
-    return replace(
-        config,
-        vary=False,
-        variation=Variation(),
-        like_drake=False,
-        felt_damping=False,
-        timestep_divisor=1,
-        own_ranks=0,
-    )
+    return in_own_worlds(config, own_ranks=0)
 
 
 def plays_own(config: TrainConfig, rank: int, ranks: int) -> bool:

@@ -19,7 +19,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
@@ -43,9 +43,9 @@ from rl.directions import (
 from rl.policy import Policy, as_trained, load_policy, packed_weights, write_policy
 from rl.policy_stack import PolicyStack
 from rl.polish_config import Polish
-from rl.runlog import Row, RunLog
+from rl.runlog import KINDS, Row, RunLog
 from rl.trials import Share, opened, play_episodes
-from rl.worlds import engine_options
+from rl.worlds import engine_options, in_own_worlds
 from sports.env import Env
 from sports.humanoid.body import load_body
 from sports.physics.variation import Variation
@@ -54,6 +54,8 @@ from warmstart.evolution import strategy
 from warmstart.npz import read_npz, write_npz
 
 T = TypeVar("T")
+Trials = dict[str, np.ndarray]
+"""What each of several episodes came to, by metric."""
 STATE, POLICY = "search.npz", "policy.safetensors"
 WATCHED_EVERY = 7
 """Steps between those whose observations tell how the last hidden layer varies: no divisor of a
@@ -191,9 +193,13 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
     policy = load_policy(config.policy, config.name)
     weights_of(policy)  # a baseline has none
     ways = [towards(policy, load_policy(name, config.name)) for name in config.others]
-    share = _share(config, policy, options)
+    shares = [_share(config, policy, options)]
+    if config.own_worlds:
+        shares.append(_share(in_own_worlds(config, own_worlds=False), policy, options))
     rows: list[Row] = []
-    with opened(policy, share) as env:
+    with ExitStack() as stack:
+        grounds = [(share, stack.enter_context(opened(policy, share))) for share in shares]
+        share, env = grounds[0]
         search, found, spent = _begin(config, policy, lambda: _seek(config, policy, share, env))
         changes = [moved(scaled(way, config.share), env.device) for way in ways]
         if found is not None:
@@ -201,33 +207,35 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
             changes += shifts(policy, found, config.shift, actions, config.part is None)
         directions, crowd = Directions(weights_of(policy), changes), Crowd(policy, config.blocks)
 
-        def judge(numbers: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        def judge(numbers: np.ndarray) -> tuple[np.ndarray, list[Trials]]:
             for slot, row in enumerate(numbers):
                 crowd.write(slot, directions.at(torch.from_numpy(row)))
-            trials = play_episodes(crowd, share, env).trials
-            return worth(trials, wanted).reshape(config.blocks, -1).mean(1), trials
+            played = [play_episodes(crowd, *ground).trials for ground in grounds]
+            values = [worth(x, wanted).reshape(config.blocks, -1).mean(1) for x in played]
+            return np.mean(values, 0), played
 
-        names = [f"metrics/{name}" for name in env.metric_names]
-        # What went on must not meet the starts of its beginning again.
-        env.generator.manual_seed(GENERATOR_STEP * search.generation + share.seed)
+        names = [f"{kind}/{name}" for kind in _kinds(config) for name in env.metric_names]
+        for _, each in grounds:
+            # What went on must not meet the starts of its beginning again.
+            each.generator.manual_seed(GENERATOR_STEP * search.generation + share.seed)
         with closing(RunLog(config.out, [*COLUMNS, *names], search.generation, quiet)) as log:
             began = time.monotonic()
             while not config.over(search.generation, spent.minutes):
-                values, trials = search.advance(judge)
+                values, played = search.advance(judge)
                 now = time.monotonic()
                 spent.minutes, began = spent.minutes + (now - began) / 60.0, now
-                spent.samples += int(trials["episode_steps"].sum())
+                spent.samples += sum(int(trials["episode_steps"].sum()) for trials in played)
                 _save(config, options, policy, directions, search, found, spent)
                 rows.append(
                     {
                         "iteration": search.generation,
                         "samples": spent.samples,
                         "minutes": spent.minutes,
-                        "episodes": search.generation * share.trials,
+                        "episodes": search.generation * config.played,
                         "middle": float(values[0]),
                         "candidates": float(values[1:].mean()),
                         "spread": float(np.exp(np.log(search.spreads).mean())),
-                        **{f"metrics/{name}": _mean(trials[name]) for name in env.metric_names},
+                        **_told(config, played, env.metric_names),
                     }
                 )
                 log.write(rows[-1], config.done(search.generation, spent.minutes))
@@ -272,6 +280,21 @@ def _actions(config: Polish, policy: Policy) -> list[int]:
             raise ValueError(f"no joint is called '{pattern}'; there are {', '.join(names)}")
         chosen.update(found)
     return [i for i, name in enumerate(names) if name in chosen]
+
+
+def _kinds(config: Polish) -> tuple[str, ...]:
+    """Of columns that a metric has."""
+    return ("metrics", *KINDS) if config.own_worlds else ("metrics",)
+
+
+def _told(config: Polish, played: Sequence[Trials], names: Sequence[str]) -> Row:
+    """Means over the episodes of a generation: of all, and of each kind of worlds where there are
+    two (the task's own were played last)."""
+    told: Row = {}
+    for kind, some in zip(_kinds(config), (played, played[1:], played[:1])):
+        for name in names:
+            told[f"{kind}/{name}"] = _mean(np.concatenate([trials[name] for trials in some]))
+    return told
 
 
 def _mean(values: np.ndarray) -> float | None:
@@ -346,6 +369,7 @@ def _about(config: Polish, policy: Policy) -> dict[str, Any]:
 def _worlds(config: Polish, options: dict[str, Any] | None) -> dict[str, Any]:
     """What the episodes were played in, where it is not the task's own."""
     names = ("engine", "start_noise", "timestep_divisor", "felt_damping", "vary", "like_drake")
+    names += ("own_worlds",)
     told = {name: getattr(config, name) for name in names} | {"task": options or {}}
     given, usual = vars(config.variation), vars(Variation())
     told["variation"] = {name: x for name, x in given.items() if x != usual[name]}
@@ -363,9 +387,8 @@ def _save(
 ) -> None:
     """Writes the middle as a policy, then the search."""
     middle = directions.at(torch.from_numpy(search.middle))
-    episodes = search.generation * config.blocks * config.episodes
     told = {
-        "episodes": episodes,
+        "episodes": search.generation * config.played,
         "worlds": _worlds(config, options),
         "commit": provenance.commit(),
         "hardware": provenance.hardware(),

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from rl.worlds import engine_options, other_physics
 from rl.worlds import mistakes as world_mistakes
 from sports.variation import Variation
 
@@ -47,7 +48,7 @@ class Polish:
     """Policies of a generation, besides the middle that they are drawn around."""
     episodes: int = 24
     """Of each candidate in a generation; all have the same starts, and the same worlds with
-    ``vary``."""
+    ``vary``. With ``own_worlds`` so many in each kind."""
     generations: int | None = None
     """By default as many as the minutes allow."""
     minutes: float | None = None
@@ -72,6 +73,10 @@ class Polish:
     """How, with ``--vary``: ranges and shares of worlds."""
     like_drake: bool = False
     """The worlds of a candidate differ as with ``train --like-drake``."""
+    own_worlds: bool = False
+    """Every candidate plays as many episodes in the task's own worlds at its own time step as in
+    the others, and both count alike: for what must hold in both. The log then has each metric
+    three times, ``metrics/success`` of all, ``own/success`` and ``others/success``."""
     seed: int = 0
     """Seed of all randomness."""
     strength: Literal["paper", "human"] | None = None
@@ -97,6 +102,11 @@ class Polish:
             raise ValueError("no action is shifted with components -1: leave --joints out")
         for mistake in world_mistakes(self):
             raise ValueError(mistake)
+        others = other_physics(engine_options(self, self.seed), self.timestep_divisor)
+        if self.own_worlds and not others:
+            raise ValueError(
+                "there are no worlds but the task's own: leave --own-worlds out, or give --vary"
+            )
         if self.generations is None and self.minutes is None:
             raise ValueError("say for how many generations or minutes to search")
 
@@ -104,6 +114,11 @@ class Polish:
     def blocks(self) -> int:
         """The middle and its candidates."""
         return 1 + self.candidates
+
+    @property
+    def played(self) -> int:
+        """Episodes of a generation."""
+        return self.blocks * self.episodes * (2 if self.own_worlds else 1)
 
     def done(self, generation: int, minutes: float) -> float:
         """The share of the search that is done after so many, 0 to 1."""

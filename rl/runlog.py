@@ -13,7 +13,8 @@ from warmstart.atomic import write_text
 
 Row = dict[str, float | int | None]
 KINDS = ("own", "others")
-"""Of ranks, with ``own_ranks``: a metric has a column of each, ``own/success``."""
+"""Of worlds, the task's own and others, where a run has both: a metric has a column of each,
+``own/success``."""
 
 
 class RunLog:

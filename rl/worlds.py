@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from sports.variation import Variation
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 DRAKE = Variation(friction=(0.8, 1.25), felt_share=0.8, cone_share=1.0, impratio=(2.0, 40.0))
 """Worlds that come as near to Drake as MuJoCo's do: feet stick, and contacts feel the damping."""
@@ -47,6 +50,15 @@ class Worlds(Protocol):
     def like_drake(self) -> bool:
         """They differ as in ``DRAKE``."""
         ...
+
+
+S = TypeVar("S", bound="DataclassInstance")
+
+
+def in_own_worlds(settings: S, **more: Any) -> S:
+    """The same, but for the task's own worlds at its own time step; ``more`` changes besides."""
+    usual = {"vary": False, "variation": Variation(), "like_drake": False, "felt_damping": False}
+    return replace(settings, **usual, timestep_divisor=1, **more)
 
 
 def mistakes(worlds: Worlds) -> Iterator[str]:

@@ -300,3 +300,32 @@ def shipped(task: str) -> str:
     path = pretrained.locate(task, "ppo")
     assert json.loads(path.with_suffix(".json").read_text())["task"] == task
     return str(path)
+
+
+def test_with_own_worlds_half_of_what_counts_is_what_it_is_without_others(tmp_path: Path):
+    """Along a direction that no engine has to be asked for, the candidates of one generation are
+    the same in three searches."""
+    ways = {"others": ("pretrained:ppo-human",), "components": -1, "generations": 1, "share": 0.05}
+    plain = replace(CONFIG, episodes=2, objective="length=1", **ways)
+    like = replace(plain, like_drake=True, timestep_divisor=2)
+    both = replace(like, own_worlds=True)
+    own, others, two = (
+        polish(replace(config, out=tmp_path / name), quiet=True)[0]
+        for name, config in (("plain", plain), ("like", like), ("both", both))
+    )
+    assert own["metrics/length"] != others["metrics/length"]
+    for name in ("length", "flight_time"):
+        assert two[f"own/{name}"] == own[f"metrics/{name}"]
+        assert two[f"others/{name}"] == others[f"metrics/{name}"]
+        mean = (float(own[f"metrics/{name}"]) + float(others[f"metrics/{name}"])) / 2  # type: ignore[arg-type]
+        assert two[f"metrics/{name}"] == pytest.approx(mean)
+    for name in ("middle", "candidates"):
+        assert two[name] == pytest.approx((float(own[name]) + float(others[name])) / 2)  # type: ignore[arg-type]
+    for name in ("samples", "episodes"):
+        assert two[name] == own[name] + others[name]  # type: ignore[operator]
+    assert read_progress(tmp_path / "both")[0] == pytest.approx(two)
+    card = load_policy(tmp_path / "both" / "policy.safetensors", "long_jump").metadata["polish"]
+    assert card["worlds"]["own_worlds"] and card["worlds"]["like_drake"]
+    assert card["episodes"] == 2 * 2 * 5
+    with pytest.raises(ValueError, match="no worlds but the task's own"):
+        replace(plain, own_worlds=True)
