@@ -72,6 +72,7 @@ def test_speed_is_the_asked_one_before_and_kept_after(stride):
     assert stride.stats["max_violation"] < 1e-5
 
 
+@pytest.mark.slow
 def test_the_mirrored_problem_costs_the_same(stride):
     """The left leg leads, solved from nothing. The problem has several optima, and rounding decides
     which one a coarse solve finds: mirrored motions were 1.7 cm apart (cost 1.035 of the other's),

@@ -203,7 +203,9 @@ def test_it_begins_as_the_task_does_and_takes_two_steps(walked):
         assert max(np.ptp(foot[knots], axis=0).max() for foot in (left, right)) < 2e-3
 
 
+@pytest.mark.slow
 def test_both_engines_certify_the_two_steps(walked):
+    """As the one step is above."""
     certificate = certify(walked)
     assert certificate.passed, certificate.failures
     assert certificate.stats["replay"] == CLOSED_LOOP and certificate.asked["steps"] == 2

@@ -188,6 +188,7 @@ def test_the_clip_is_played_in_the_tasks_own_scene(kicked):
     assert "ball" in [o.name for o in world.objects]
 
 
+@pytest.mark.slow
 def test_a_neighbours_kick_comes_from_this_one(kicked):
     """A little faster and to another target."""
     config = penalty_kick.Config(ball_speed=15.2, target=(0.6, 0.8), max_iterations=120)
