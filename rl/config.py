@@ -16,7 +16,7 @@ from rl.latent_action import LatentConfig
 from rl.ppo import PAPER, PPOConfig
 from rl.selfplay import SelfPlayConfig
 from rl.steady import BALANCE
-from rl.worlds import engine_options, other_physics
+from rl.worlds import are_own
 from rl.worlds import mistakes as world_mistakes
 from sports.env import Starts
 from sports.physics.variation import Variation
@@ -215,7 +215,7 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
     yield from world_mistakes(c)
     if c.own_ranks < 0:
         yield f"own-ranks must not be negative: {c.own_ranks}"
-    if c.own_ranks and not other_physics(engine_options(c, c.seed), c.timestep_divisor):
+    if c.own_ranks and are_own(c):
         yield "all processes play in the task's own worlds: leave --own-ranks out, or give --vary"
     if c.clone < 0:
         yield f"clone must not be negative: {c.clone}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import torch
 from torch import Tensor
 
@@ -61,8 +63,7 @@ class Normalizer:
     def commit(self) -> None:
         """Merges the pending moments of every rank into the statistics in use."""
         before = self._total
-        for part in gathered(self._pending):
-            self._total = merge(self._total, part)
+        self._total = reduce(merge, gathered(self._pending), before)
         self._hold(before)
         self._pending = torch.zeros_like(self._pending)
         self._refresh()
@@ -86,12 +87,8 @@ class Normalizer:
         """Gives some features (D,) bool, of which nothing is known yet, the moments that are now
         pending in all ranks, as if every sample in use had shown them. Call it before ``commit``.
         """
-        parts = gathered(self._pending)
-        seen = parts[0]
-        for part in parts[1:]:
-            seen = merge(seen, part)
         count, mean, squares = _split(self._total)
-        shown, new_mean, new_squares = _split(seen)
+        shown, new_mean, new_squares = _split(reduce(merge, gathered(self._pending)))
         new_squares = new_squares * (count / shown.clamp(min=1.0))
         mean = torch.where(columns, new_mean, mean)
         squares = torch.where(columns, new_squares, squares)

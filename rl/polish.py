@@ -368,9 +368,8 @@ def _about(config: Polish, policy: Policy) -> dict[str, Any]:
 
 def _worlds(config: Polish, options: dict[str, Any] | None) -> dict[str, Any]:
     """What the episodes were played in, where it is not the task's own."""
-    names = ("engine", "start_noise", "timestep_divisor", "felt_damping", "vary", "like_drake")
-    names += ("own_worlds",)
-    told = {name: getattr(config, name) for name in names} | {"task": options or {}}
+    names = ("start_noise", "timestep_divisor", "felt_damping", "vary", "like_drake", "own_worlds")
+    told = {name: getattr(config, name) for name in ("engine", *names)} | {"task": options or {}}
     given, usual = vars(config.variation), vars(Variation())
     told["variation"] = {name: x for name, x in given.items() if x != usual[name]}
     return {name: x for name, x in told.items() if x}

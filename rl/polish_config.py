@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from rl.worlds import engine_options, other_physics
+from rl.worlds import are_own
 from rl.worlds import mistakes as world_mistakes
 from sports.variation import Variation
 
@@ -102,8 +102,7 @@ class Polish:
             raise ValueError("no action is shifted with components -1: leave --joints out")
         for mistake in world_mistakes(self):
             raise ValueError(mistake)
-        others = other_physics(engine_options(self, self.seed), self.timestep_divisor)
-        if self.own_worlds and not others:
+        if self.own_worlds and are_own(self):
             raise ValueError(
                 "there are no worlds but the task's own: leave --own-worlds out, or give --vary"
             )

@@ -95,6 +95,11 @@ def engine_options(worlds: Worlds, seed: int) -> dict[str, Any]:
     return options
 
 
+def are_own(worlds: Worlds) -> bool:
+    """Whether they are all like the task's own, at its own time step."""
+    return not other_physics(engine_options(worlds, 0), worlds.timestep_divisor)
+
+
 def other_physics(options: Mapping[str, Any], timestep_divisor: int) -> dict[str, Any]:
     """``OTHER_PHYSICS`` of a result, from the engine's options; empty where it was the task's."""
     other: dict[str, Any] = {}
