@@ -272,8 +272,7 @@ def learned(card: dict[str, Any], agent: Mapping[str, Tensor], where: str) -> Po
     """The policy in a learner's state, on the CPU, with its critic; without the latent prior that
     it may need to play. Raises PolicyError naming what is wrong with the card."""
     weights = {k.removeprefix("actor."): v for k, v in agent.items() if k.startswith("actor.")}
-    digest = hashlib.sha256(save(weights)).hexdigest()
-    policy = _build({**card, "sha256": digest}, weights, where)
+    policy = _signed(card, weights, where)
     policy.extra = {k: v for k, v in agent.items() if k.startswith(("critic.", "value_norm."))}
     return policy
 
@@ -299,11 +298,15 @@ def _from_pool(run: Path, which: str) -> Policy:
         "metrics": {},
         "obs_mean": mean.tolist(),
         "obs_std": std.tolist(),
-        "sha256": hashlib.sha256(save(weights)).hexdigest(),
     }
-    policy = _build(card, weights, f"{run}@{which}")
+    policy = _signed(card, weights, f"{run}@{which}")
     policy.prior = learner.prior
     return policy
+
+
+def _signed(card: dict[str, Any], weights: dict[str, Tensor], where: str) -> Policy:
+    """Of weights that are in no file of their own: the card gets their sha256."""
+    return _build({**card, "sha256": hashlib.sha256(save(weights)).hexdigest()}, weights, where)
 
 
 def _from_file(path: Path) -> Policy:

@@ -20,7 +20,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -174,6 +174,25 @@ class Spent:
     minutes: float = 0.0
     samples: int = 0
     """Control steps of episodes that counted."""
+    stages: list[dict[str, Any]] = field(default_factory=list)
+    """Episodes and the worlds that they were played in; another one where a call goes on in other
+    worlds."""
+
+    @property
+    def episodes(self) -> int:
+        """Of all stages."""
+        return sum(stage["episodes"] for stage in self.stages)
+
+    def enter(self, worlds: dict[str, Any]) -> None:
+        """What comes is played in these."""
+        if not self.stages or self.stages[-1]["worlds"] != worlds:
+            self.stages.append({"episodes": 0, "worlds": worlds})
+
+    def add(self, minutes: float, samples: int, episodes: int) -> None:
+        """A generation."""
+        self.minutes += minutes
+        self.samples += samples
+        self.stages[-1]["episodes"] += episodes
 
 
 COLUMNS = ("iteration", "samples", "minutes", "episodes", "middle", "candidates", "spread")
@@ -206,6 +225,7 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
             actions = _actions(config, policy)
             changes += shifts(policy, found, config.shift, actions, config.part is None)
         directions, crowd = Directions(weights_of(policy), changes), Crowd(policy, config.blocks)
+        spent.enter(_worlds(config, options))
 
         def judge(numbers: np.ndarray) -> tuple[np.ndarray, list[Trials]]:
             for slot, row in enumerate(numbers):
@@ -223,15 +243,16 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
             while not config.over(search.generation, spent.minutes):
                 values, played = search.advance(judge)
                 now = time.monotonic()
-                spent.minutes, began = spent.minutes + (now - began) / 60.0, now
-                spent.samples += sum(int(trials["episode_steps"].sum()) for trials in played)
-                _save(config, options, policy, directions, search, found, spent)
+                steps = sum(int(trials["episode_steps"].sum()) for trials in played)
+                spent.add((now - began) / 60.0, steps, config.played)
+                began = now
+                _save(config, policy, directions, search, found, spent)
                 rows.append(
                     {
                         "iteration": search.generation,
                         "samples": spent.samples,
                         "minutes": spent.minutes,
-                        "episodes": search.generation * config.played,
+                        "episodes": spent.episodes,
                         "middle": float(values[0]),
                         "candidates": float(values[1:].mean()),
                         "spread": float(np.exp(np.log(search.spreads).mean())),
@@ -341,14 +362,14 @@ def _begin(
     if path.exists():
         needed = ("middle", "spreads")
         arrays, meta = read_npz(path, needed, ("phase_middle", "phase_axes"), what="search")
-        if meta.get("about") != _about(config, policy):
+        if meta.get("about") != _about(config, policy) or "stages" not in meta:
             raise ValueError(f"'{config.out}' holds another search: give another folder")
         kept = [arrays.get(name) for name in ("phase_middle", "phase_axes")]
         found = None
         if kept[0] is not None and kept[1] is not None:
             found = Phases(*(torch.tensor(x, dtype=torch.float32, device=device) for x in kept))
         middle, spreads, generation = arrays["middle"], arrays["spreads"], int(meta["generation"])
-        spent = Spent(float(meta["minutes"]), int(meta["samples"]))
+        spent = Spent(float(meta["minutes"]), int(meta["samples"]), meta["stages"])
     else:
         found = None if config.components < 0 else seek()
         each = config.components + (config.part is None)
@@ -367,17 +388,16 @@ def _about(config: Polish, policy: Policy) -> dict[str, Any]:
 
 
 def _worlds(config: Polish, options: dict[str, Any] | None) -> dict[str, Any]:
-    """What the episodes were played in, where it is not the task's own."""
+    """What the episodes of a call are played in, where it is not the task's own."""
     names = ("start_noise", "timestep_divisor", "felt_damping", "vary", "like_drake", "own_worlds")
     told = {name: getattr(config, name) for name in ("engine", *names)} | {"task": options or {}}
     given, usual = vars(config.variation), vars(Variation())
     told["variation"] = {name: x for name, x in given.items() if x != usual[name]}
-    return {name: x for name, x in told.items() if x}
+    return json.loads(json.dumps({name: x for name, x in told.items() if x}))
 
 
 def _save(
     config: Polish,
-    options: dict[str, Any] | None,
     policy: Policy,
     directions: Directions,
     search: Search,
@@ -387,8 +407,8 @@ def _save(
     """Writes the middle as a policy, then the search."""
     middle = directions.at(torch.from_numpy(search.middle))
     told = {
-        "episodes": search.generation * config.played,
-        "worlds": _worlds(config, options),
+        "episodes": spent.episodes,
+        "stages": spent.stages,
         "commit": provenance.commit(),
         "hardware": provenance.hardware(),
     }

@@ -203,7 +203,7 @@ def test_a_search_that_was_stopped_goes_on_and_its_middle_is_what_was_written(tm
     torch.testing.assert_close(weights_of(written)["trunk.0.weight"], same, atol=1e-4, rtol=2e-3)
 
     played_in = {"engine": "mujoco", "start_noise": 0.02, "timestep_divisor": 1}
-    assert written.metadata["polish"]["worlds"] == played_in
+    assert written.metadata["polish"]["stages"] == [{"episodes": 2 * 5, "worlds": played_in}]
     assert curves.main([str(tmp_path / "whole"), str(tmp_path / "curve.json")]) == 0
     curve = json.loads((tmp_path / "curve.json").read_text())
     assert curve["rows"]["middle"] == pytest.approx([row["middle"] for row in told], rel=1e-5)
@@ -219,6 +219,13 @@ def test_a_search_that_was_stopped_goes_on_and_its_middle_is_what_was_written(tm
     assert kept[0]["samples"] == told[0]["samples"]
     for name in ("samples", "minutes"):
         assert float(kept[1][name] or 0) > float(kept[0][name] or 0) > 0, name
+    again = load_policy(parts.out / "policy.safetensors", "long_jump").metadata["polish"]
+    assert again["stages"] == written.metadata["polish"]["stages"]
+    elsewhere = replace(parts, generations=3, episodes=2, felt_damping=True)
+    assert polish(elsewhere, quiet=True)[0]["episodes"] == 10 + 10
+    on = load_policy(parts.out / "policy.safetensors", "long_jump").metadata["polish"]
+    felt = {"episodes": 10, "worlds": {**played_in, "felt_damping": True}}
+    assert (on["episodes"], on["stages"]) == (20, [*again["stages"], felt])
     with pytest.raises(ValueError, match="another search"):
         polish(replace(parts, shift=0.1))
 
@@ -325,7 +332,8 @@ def test_with_own_worlds_half_of_what_counts_is_what_it_is_without_others(tmp_pa
         assert two[name] == own[name] + others[name]  # type: ignore[operator]
     assert read_progress(tmp_path / "both")[0] == pytest.approx(two)
     card = load_policy(tmp_path / "both" / "policy.safetensors", "long_jump").metadata["polish"]
-    assert card["worlds"]["own_worlds"] and card["worlds"]["like_drake"]
-    assert card["episodes"] == 2 * 2 * 5
+    [stage] = card["stages"]
+    assert stage["worlds"]["own_worlds"] and stage["worlds"]["like_drake"]
+    assert stage["episodes"] == card["episodes"] == 2 * 2 * 5
     with pytest.raises(ValueError, match="no worlds but the task's own"):
         replace(plain, own_worlds=True)
