@@ -5,8 +5,9 @@ until the first ground contact of any link, LANDED for 9 more steps; the length 
 of any ground contact point in those steps, minus 20. A link on the ground on or beyond the line
 before the flight is a foul. Source: SMPLOlympics section 4 for goal and reward; World Athletics
 technical rules for the foul and for measuring to the nearest mark left by any part of the body.
-Those rules also forbid somersaults; the paper's task does not, so ``rotation`` tells them apart:
-the angle that the pelvis turns about the lateral axis in flight (2 pi for a front somersault).
+Those rules also forbid somersaults; the paper's task does not, so that is an option, and
+``rotation`` tells them apart: the angle that the pelvis turns about the lateral axis in flight
+(2 pi for a front somersault).
 """
 
 from __future__ import annotations
@@ -45,6 +46,10 @@ TOUCH = 1e-3
 @dataclass(frozen=True)
 class LongJump:
     """Options of the long jump."""
+
+    somersaults: bool = True
+    """Allow them, as the paper does. False: who turns over in flight, so that the pelvis is more
+    upside down than upright, has failed, by rule 30 of World Athletics' technical rules."""
 
 
 def scene(config: LongJump, body: Body) -> Scene:
@@ -98,7 +103,6 @@ def advance(view: View, memory: Memory) -> Advance:
 
     mode = memory["mode"]
     running, over_line = mode == RUN, x > LINE_X
-    foul = running & (front >= LINE_X)
     fell = running & view.fallen()[:, 0]
     half_width = RUNWAY_HALF_WIDTH + (PIT_HALF_WIDTH - RUNWAY_HALF_WIDTH) * over_line
     off_track = y.abs() > half_width
@@ -106,7 +110,10 @@ def advance(view: View, memory: Memory) -> Advance:
     takes_off = running & ~touches & over_line
     lands = (mode == FLIGHT) & touches
     mode = mode + takes_off + lands  # from RUN to FLIGHT to LANDED
-    landed = mode == LANDED
+    flying, landed = mode == FLIGHT, mode == LANDED
+    foul = running & (front >= LINE_X)
+    if not view.config.somersaults:
+        foul = foul | (flying & (view.rotation[:, 0, 0, 2, 2] < 0.0))
     mark = torch.minimum(memory["mark"], nearest.masked_fill(~landed, torch.inf))
     since_landing = memory["since_landing"] + (landed & ~lands)
     measured = landed & (since_landing >= MARK_STEPS)
@@ -114,7 +121,6 @@ def advance(view: View, memory: Memory) -> Advance:
     success = measured & ~failed
     length = mark - LINE_X
 
-    flying = mode == FLIGHT
     terms = {
         "progress": clamp01(progress(memory["root"], root, goal)),
         "speed": 0.01 * view.root_linvel[:, 0, 0],

@@ -175,6 +175,43 @@ def test_a_somersault_is_told_by_its_rotation():
     assert last.metrics["rotation"][0] == pytest.approx(10 / 30 * 6.0, abs=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("turned", "allowed", "counts"),
+    [
+        (85, False, True),
+        (-85, False, True),
+        (95, False, False),
+        (-95, False, False),
+        (95, True, True),
+    ],
+)
+def test_who_turns_over_in_flight_has_failed_where_somersaults_are_not_allowed(
+    turned: int, allowed: bool, counts: bool
+):
+    """Tipped forward and back, and sideways by the same angle; in the sand it is no matter."""
+    for axis in (2, 1):  # of the quaternion: y, x
+        world = HandMade("long_jump", somersaults=allowed)
+        world.place((19.0, 0, STANDING))
+        world.begin()
+        upright = world.state.qpos[:, 3:7].clone()
+        half = math.radians(turned) / 2
+        world.place((20.3, 0, 1.5))
+        world.state.qpos[:, 3:7] = 0.0
+        world.state.qpos[:, 3], world.state.qpos[:, 3 + axis] = math.cos(half), math.sin(half)
+        step = world.advance()
+        assert bool(step.terminated[0]) is not counts
+        assert bool(step.metrics["foul"][0]) is not counts
+        if not counts:
+            continue
+        world.state.qpos[:, 3:7] = upright
+        world.place((23.0, 0, 0.9))
+        world.drop_to_ground("L_Ankle")
+        world.advance({"L_Ankle": 400.0})
+        world.state.qpos[:, 3:7] = torch.tensor([0.0, 0.0, 1.0, 0.0])  # head down in the sand
+        world.drop_to_ground("L_Ankle")
+        assert bool([world.advance() for _ in range(9)][-1].success[0])
+
+
 def test_length_bound_is_the_best_ballistic_range():
     """Independent: the range maximised over the angle by brute force."""
     speed, drop, g = 9.5, 0.6, 9.81
