@@ -144,13 +144,14 @@ class Search:
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng((self.seed, self.generation))
+        largest = float(self.spreads.max())  # a single one must be 1 to the package
         self._strategy = strategy(
             self.middle,
-            1.0,
+            largest,
             self.candidates,
             lambda: self._rng,
             CMA_diagonal=True,
-            CMA_stds=self.spreads,
+            CMA_stds=self.spreads / largest,
             maxiter=np.inf,
         )
 
@@ -211,7 +212,8 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
     wanted = aims(config.objective, config.name)
     policy = load_policy(config.policy, config.name)
     weights_of(policy)  # a baseline has none
-    ways = [towards(policy, load_policy(name, config.name)) for name in config.others]
+    others = [load_policy(name, config.name) for name in config.others]
+    ways, about = [towards(policy, other) for other in others], _about(config, policy, others)
     shares = [_share(config, policy, options)]
     if config.own_worlds:
         shares.append(_share(in_own_worlds(config, own_worlds=False), policy, options))
@@ -219,7 +221,9 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
     with ExitStack() as stack:
         grounds = [(share, stack.enter_context(opened(policy, share))) for share in shares]
         share, env = grounds[0]
-        search, found, spent = _begin(config, policy, lambda: _seek(config, policy, share, env))
+        search, found, spent = _begin(
+            config, policy, about, lambda: _seek(config, policy, share, env)
+        )
         changes = [moved(scaled(way, config.share), env.device) for way in ways]
         if found is not None:
             actions = _actions(config, policy)
@@ -246,7 +250,7 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
                 steps = sum(int(trials["episode_steps"].sum()) for trials in played)
                 spent.add((now - began) / 60.0, steps, config.played)
                 began = now
-                _save(config, policy, directions, search, found, spent)
+                _save(config, policy, about, directions, search, found, spent)
                 rows.append(
                     {
                         "iteration": search.generation,
@@ -353,7 +357,7 @@ def _seek(config: Polish, policy: Policy, share: Share, env: Env) -> Phases:
 
 
 def _begin(
-    config: Polish, policy: Policy, seek: Callable[[], Phases]
+    config: Polish, policy: Policy, about: dict[str, Any], seek: Callable[[], Phases]
 ) -> tuple[Search, Phases | None, Spent]:
     """A new search with the phases that it shifts actions in, or what ``out`` holds of one. Raises
     ValueError for another one's."""
@@ -362,7 +366,7 @@ def _begin(
     if path.exists():
         needed = ("middle", "spreads")
         arrays, meta = read_npz(path, needed, ("phase_middle", "phase_axes"), what="search")
-        if meta.get("about") != _about(config, policy) or "stages" not in meta:
+        if meta.get("about") != about or "stages" not in meta:
             raise ValueError(f"'{config.out}' holds another search: give another folder")
         kept = [arrays.get(name) for name in ("phase_middle", "phase_axes")]
         found = None
@@ -378,10 +382,11 @@ def _begin(
     return Search(middle, spreads, config.candidates, config.seed, generation), found, spent
 
 
-def _about(config: Polish, policy: Policy) -> dict[str, Any]:
-    """What a search that goes on must have been about."""
-    names = ("others", "components", "joints", "objective", "shift", "share")
-    said = {name: getattr(config, name) for name in names}
+def _about(config: Polish, policy: Policy, others: Sequence[Policy]) -> dict[str, Any]:
+    """What a search that goes on must have been about: policies by their sha256."""
+    names = ("components", "joints", "objective", "shift", "share")
+    said: dict[str, Any] = {"others": [other.metadata["sha256"] for other in others]}
+    said |= {name: getattr(config, name) for name in names}
     if config.part is not None:
         said["part"] = config.part
     return json.loads(json.dumps(said | {"of": policy.metadata["sha256"]}))
@@ -399,6 +404,7 @@ def _worlds(config: Polish, options: dict[str, Any] | None) -> dict[str, Any]:
 def _save(
     config: Polish,
     policy: Policy,
+    about: dict[str, Any],
     directions: Directions,
     search: Search,
     found: Phases | None,
@@ -415,7 +421,7 @@ def _save(
     card = {
         **policy.metadata,
         "precision": "float16",
-        "polish": _about(config, policy) | told,
+        "polish": about | told,
         "metrics": {},
     }
     write_policy(packed_weights(moved(middle, "cpu")), card, config.out / POLICY)
@@ -425,5 +431,5 @@ def _save(
             "phase_middle": found.middle.cpu().numpy(),
             "phase_axes": found.axes.cpu().numpy(),
         }
-    meta = {"about": _about(config, policy), "generation": search.generation}
+    meta = {"about": about, "generation": search.generation}
     write_npz(config.out / STATE, arrays, meta | asdict(spent))

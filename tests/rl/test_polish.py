@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from rl import curves
+from rl import curves, pretrained
 from rl.directions import (
     Directions,
     phases,
@@ -335,5 +335,12 @@ def test_with_own_worlds_half_of_what_counts_is_what_it_is_without_others(tmp_pa
     [stage] = card["stages"]
     assert stage["worlds"]["own_worlds"] and stage["worlds"]["like_drake"]
     assert stage["episodes"] == card["episodes"] == 2 * 2 * 5
+    # Others are told by their weights, wherever they lie.
+    other = pretrained.locate("long_jump", "ppo-human")
+    assert card["others"] == [load_policy(str(other), "long_jump").metadata["sha256"]]
+    on = replace(plain, out=tmp_path / "plain", generations=2)
+    with pytest.raises(ValueError, match="another search"):
+        polish(replace(on, others=(str(tmp_path / "both" / "policy.safetensors"),)))
+    assert len(polish(replace(on, others=(str(other),)), quiet=True)) == 1
     with pytest.raises(ValueError, match="no worlds but the task's own"):
         replace(plain, own_worlds=True)
