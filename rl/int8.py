@@ -58,8 +58,9 @@ def fitted(actor: MLP, inputs: Tensor) -> dict[str, Tensor]:
         if not isinstance(layer, nn.Linear):
             exact, approximate = layer(exact), layer(approximate)
             continue
-        name, wanted = f"trunk.{index}", exact @ layer.weight.double().T
-        weight = _nearest(layer.weight.double(), approximate, wanted)
+        name, weight = f"trunk.{index}", layer.weight.double()
+        wanted = exact @ weight.T
+        weight = _nearest(weight, approximate, wanted)
         scale = _scale(weight.float())
         levels = _levels(weight, scale.double(), approximate)
         exact = wanted + layer.bias.double()
@@ -69,8 +70,9 @@ def fitted(actor: MLP, inputs: Tensor) -> dict[str, Tensor]:
         out[f"{name}.weight"] = levels.to(torch.int8)
         out[f"{name}.weight{SCALE}"] = scale
         out[f"{name}.bias"] = bias
-    wanted = exact @ actor.head.weight.double().T
-    head = _nearest(actor.head.weight.double(), approximate, wanted).half()
+    weight = actor.head.weight.double()
+    wanted = exact @ weight.T
+    head = _nearest(weight, approximate, wanted).half()
     left = (wanted - approximate @ head.double().T).mean(0)
     out[f"{LAST}weight"] = head
     out[f"{LAST}bias"] = (actor.head.bias.double() + left).half()
@@ -86,7 +88,7 @@ def _nearest(weight: Tensor, inputs: Tensor, wanted: Tensor) -> Tensor:
     """(M, n) weights near ``weight`` whose products with the inputs, less their means, are next to
     the outputs ``wanted``, less theirs."""
     centred = inputs - inputs.mean(0)
-    missing = (wanted - inputs @ weight.T) - (wanted - inputs @ weight.T).mean(0)
+    missing = wanted - inputs @ weight.T  # its means are nothing to centred inputs
     moments = _damped(centred, RIDGE)
     return weight + torch.linalg.solve(moments, centred.T @ missing / len(inputs)).T
 

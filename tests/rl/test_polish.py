@@ -300,11 +300,9 @@ def test_joints_that_are_not_named_keep_their_actions(tmp_path: Path):
     assert moved and moved <= {"R_Shoulder_x", "R_Shoulder_y", "R_Shoulder_z", "Torso_y"}
 
 
-def shipped(task: str) -> str:
+def shipped(task: str, name: str = "ppo") -> str:
     """File of a shipped policy."""
-    from rl import pretrained
-
-    path = pretrained.locate(task, "ppo")
+    path = pretrained.locate(task, name)
     assert json.loads(path.with_suffix(".json").read_text())["task"] == task
     return str(path)
 
@@ -336,11 +334,11 @@ def test_with_own_worlds_half_of_what_counts_is_what_it_is_without_others(tmp_pa
     assert stage["worlds"]["own_worlds"] and stage["worlds"]["like_drake"]
     assert stage["episodes"] == card["episodes"] == 2 * 2 * 5
     # Others are told by their weights, wherever they lie.
-    other = pretrained.locate("long_jump", "ppo-human")
-    assert card["others"] == [load_policy(str(other), "long_jump").metadata["sha256"]]
+    other = shipped("long_jump", "ppo-human")
+    assert card["others"] == [load_policy(other, "long_jump").metadata["sha256"]]
     on = replace(plain, out=tmp_path / "plain", generations=2)
     with pytest.raises(ValueError, match="another search"):
         polish(replace(on, others=(str(tmp_path / "both" / "policy.safetensors"),)))
-    assert len(polish(replace(on, others=(str(other),)), quiet=True)) == 1
+    assert len(polish(replace(on, others=(other,)), quiet=True)) == 1
     with pytest.raises(ValueError, match="no worlds but the task's own"):
         replace(plain, own_worlds=True)
