@@ -16,7 +16,7 @@ import tyro
 
 from olympics_opt import meter
 from olympics_opt.meter import SIGMA, Row, measure
-from olympics_opt.soak import STEPS, soak
+from olympics_opt.soak import STEPS, soak_shared
 from olympics_opt.speeds import overflowed, rate
 from rl import provenance
 from sports.registry import get_task, task_names
@@ -57,6 +57,8 @@ class BenchConfig:
     """Control steps of an endurance run."""
     minutes: float | None = None
     """Time limit of this call for each endurance run."""
+    processes: int = 1
+    """Processes that share out the worlds of an endurance run, each on a GPU of its own."""
     keep: Path | None = None
     """Folder in which endurance runs keep their worlds, so that the same command goes on."""
 
@@ -160,6 +162,7 @@ def soak_all(
     seed: int = 0,
     minutes: float | None = None,
     keep: Path | None = None,
+    processes: int = 1,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Plays every task for a long time under random actions and writes what happened as JSON.
@@ -169,7 +172,8 @@ def soak_all(
     how many steps it has come to. Each row says at which commit and on what it was measured last.
 
     Arguments as of :func:`bench`; ``steps``: control steps of each world; ``minutes``: of each task
-    in this call; ``keep``: folder of the worlds of tasks that are to go on.
+    in this call; ``keep``: folder of the worlds of tasks that are to go on; ``processes``: that
+    share out the worlds, each on a GPU of its own.
 
     Raises:
         ValueError: unknown task or engine, or counts that are not positive.
@@ -196,10 +200,11 @@ def soak_all(
                     def show(step: int, bar: Any = bar) -> None:
                         progress.update(bar, completed=step)
 
-                    found = soak(
+                    found = soak_shared(
                         task,
                         engine,
                         worlds=count,
+                        processes=processes,
                         steps=steps,
                         seed=seed,
                         on_step=show,
@@ -280,6 +285,7 @@ def main(args: Sequence[str] | None = None) -> int:
             seed=config.seed,
             minutes=config.minutes,
             keep=config.keep,
+            processes=config.processes,
         )
         return 0
     bench(

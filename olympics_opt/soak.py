@@ -6,10 +6,12 @@ buffers that overflow, rewards or observations of absurd size, and memory that g
 
 from __future__ import annotations
 
+import multiprocessing
 import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +57,8 @@ class Soak:
     device_memory_gib: tuple[float, float] | None
     """Memory of the GPU in use after a hundredth of the steps and at the end."""
     host_memory_gib: float
+    processes: int = 1
+    """That shared the worlds out; memory is that of all of them."""
 
     @property
     def clean(self) -> bool:
@@ -153,6 +157,103 @@ def soak(
         )
     finally:
         env.close()
+
+
+def soak_shared(
+    task: str,
+    engine: str,
+    *,
+    worlds: int,
+    processes: int,
+    steps: int = STEPS,
+    seed: int = 0,
+    on_step: Callable[[int], None] | None = None,
+    keep: Path | None = None,
+    minutes: float | None = None,
+) -> Soak:
+    """:func:`soak` with the worlds shared out among processes, each on a GPU of its own where the
+    engine needs one.
+
+    Every process has its own seed, from ``seed`` on. ``keep`` gets a folder of each; ``on_step`` is
+    called with ``steps`` as each of them ends.
+
+    Raises:
+        ValueError: as :func:`soak`; fewer worlds than processes, no process.
+        CheckpointError: as :func:`soak`.
+        RuntimeError: as :func:`soak`; fewer GPUs than processes.
+    """
+    if processes == 1:
+        return soak(
+            task,
+            engine,
+            worlds=worlds,
+            steps=steps,
+            seed=seed,
+            on_step=on_step,
+            keep=keep,
+            minutes=minutes,
+        )
+    if not 1 <= processes <= worlds:
+        raise ValueError(f"{worlds} worlds cannot be shared out among {processes} processes")
+    gpus = torch.cuda.device_count() if engine == "warp" else 0
+    if 0 < gpus < processes:
+        raise RuntimeError(f"{processes} processes need a GPU each; here are {gpus}")
+    shares = [worlds // processes + (i < worlds % processes) for i in range(processes)]
+    found: dict[int, Soak] = {}
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=context) as pool:
+        futures = {
+            pool.submit(
+                _soak_share,
+                i if gpus else None,
+                task,
+                engine,
+                worlds=share,
+                steps=steps,
+                seed=seed + i,
+                keep=None if keep is None else keep / f"share_{i}",
+                minutes=minutes,
+            ): i
+            for i, share in enumerate(shares)
+        }
+        for future in as_completed(futures):
+            found[futures[future]] = future.result()
+            if on_step is not None:
+                on_step(steps * len(found) // processes)
+    return together([found[i] for i in range(processes)])
+
+
+def _soak_share(gpu: int | None, task: str, engine: str, **options: Any) -> Soak:
+    """In a process of its own: its share of the worlds, on its GPU."""
+    torch.set_num_threads(1)
+    if gpu is not None:
+        torch.cuda.set_device(gpu)
+    return soak(task, engine, **options)
+
+
+def together(shares: Sequence[Soak]) -> Soak:
+    """What several runs of one task and engine, at the same time, come to: counts and memory
+    add up, of the steps the fewest count."""
+    memory = [each.device_memory_gib for each in shares if each.device_memory_gib is not None]
+    return replace(
+        shares[0],
+        worlds=sum(each.worlds for each in shares),
+        steps=min(each.steps for each in shares),
+        episodes=sum(each.episodes for each in shares),
+        bad_observations=sum(each.bad_observations for each in shares),
+        bad_rewards=sum(each.bad_rewards for each in shares),
+        largest_observation=max(each.largest_observation for each in shares),
+        largest_reward=max(each.largest_reward for each in shares),
+        nan_worlds=sum(each.nan_worlds for each in shares),
+        overflow=sum(each.overflow for each in shares),
+        overflows=dict(sum((Counter(each.overflows) for each in shares), Counter())),
+        steps_per_second=sum(each.steps_per_second for each in shares),
+        device_memory_gib=(sum(early for early, _ in memory), sum(late for _, late in memory))
+        if memory
+        else None,
+        host_memory_gib=sum(each.host_memory_gib for each in shares),
+        processes=len(shares),
+    )
 
 
 def _begin(keep: Path | None, about: dict[str, Any], env: Env) -> Tally:

@@ -14,7 +14,7 @@ import torch
 
 from olympics_opt import bench
 from olympics_opt.meter import Meter, measure, summary
-from olympics_opt.soak import soak
+from olympics_opt.soak import soak, soak_shared
 from rl.ppo import PPOConfig
 from sports.env import make_env
 from sports.humanoid.mjcf import build_model
@@ -196,6 +196,25 @@ def test_an_endurance_run_in_two_goes_is_the_same_as_in_one(tmp_path: Path) -> N
     assert short.steps == 100  # looked at each hundredth
     with pytest.raises(ValueError, match="minutes"):
         soak("long_jump", "mujoco", worlds=3, minutes=0.0)
+
+
+def test_an_endurance_run_shared_out_is_the_sum_of_its_shares(tmp_path: Path) -> None:
+    shared = soak_shared("long_jump", "mujoco", worlds=5, processes=2, steps=90, seed=3)
+    shares = [
+        soak("long_jump", "mujoco", worlds=3, steps=90, seed=3),
+        soak("long_jump", "mujoco", worlds=2, steps=90, seed=4),
+    ]
+    assert (shared.worlds, shared.processes, shared.steps) == (5, 2, 90)
+    assert shared.episodes == sum(each.episodes for each in shares) > 5
+    for name in ("largest_observation", "largest_reward"):
+        assert getattr(shared, name) == max(getattr(each, name) for each in shares), name
+    assert shared.clean and shared.device_memory_gib is None
+    two = {"worlds": 5, "processes": 2, "seed": 3, "keep": tmp_path / "worlds"}
+    assert soak_shared("long_jump", "mujoco", steps=50, **two).steps == 50
+    assert soak_shared("long_jump", "mujoco", steps=90, **two).episodes == shared.episodes
+    for count in (0, 6):
+        with pytest.raises(ValueError, match="cannot be shared out"):
+            soak_shared("long_jump", "mujoco", worlds=5, processes=count)
 
 
 def test_a_soak_counts_what_goes_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
