@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -13,7 +14,10 @@ def run_polish(config: Polish) -> int:
     from olympics_opt.cli import chosen_options
     from rl.polish import POLICY, polish
 
-    if not polish(config, chosen_options(config, "task")):
+    rows = polish(config, chosen_options(config, "task"))
+    if os.environ.get("RANK", "0") != "0":  # the first process tells
+        return 0
+    if not rows:
         print("nothing left to do: give more --generations or --minutes")
     print(f"wrote {config.out / POLICY}")
     print(f"next: olympics-opt evaluate {config.name} --policy {config.out / POLICY} --out FILE")

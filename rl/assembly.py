@@ -6,7 +6,6 @@ same first weights.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -25,7 +24,7 @@ from rl.config import (
     load_placed_starts,
     load_starts,
 )
-from rl.host import local_ranks, pick_device
+from rl.host import pick_device, threads_of_rank
 from rl.meter import EpisodeMeter
 from rl.parts import ImitationReward, Impacts, Lesson, Opponents, Part, Style
 from rl.policy import read_policy
@@ -182,10 +181,7 @@ def plays_own(config: TrainConfig, rank: int, ranks: int) -> bool:
 
 def default_env(config: TrainConfig, seed: int) -> Env:
     """The config's task on its engine, in training mode."""
-    physics_options = dict(config.physics_options)
-    if config.engine == "mujoco" and local_ranks() > 1:
-        each = max(1, (os.cpu_count() or 1) // local_ranks())
-        physics_options = {"threads": each} | physics_options
+    physics_options = threads_of_rank(config.engine) | config.physics_options
     physics_options |= engine_options(config, seed)
     if config.task == PRIOR:
         from rl.distillation import make_distillation_env

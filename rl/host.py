@@ -104,6 +104,20 @@ def join_ranks(device: str = "auto", share: bool = False) -> bool:
     return True
 
 
+def leave_ranks(began: bool) -> None:
+    """What ``join_ranks`` began. Not after an error of one rank: the others would be waited for,
+    and torchrun ends them."""
+    if began:
+        dist.destroy_process_group()
+
+
+def threads_of_rank(engine: str) -> dict[str, int]:
+    """Options of an engine on the CPU that share the processors out among the ranks here."""
+    if engine != "mujoco" or local_ranks() == 1:
+        return {}
+    return {"threads": max(1, (os.cpu_count() or 1) // local_ranks())}
+
+
 def local_ranks() -> int:
     """Processes of this run on this machine."""
     return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))

@@ -9,6 +9,9 @@ a few directions in the space of the weights (``rl/directions.py``): towards oth
 same training, and shifts of the actions in step with the phases of the motion. Its middle is the
 result.
 
+Under ``torchrun`` every process (rank) plays the same candidates from starts of its own, and what
+counts is what they come to in all of them.
+
 Shapes: C candidates besides the middle, E episodes of each, K directions.
 """
 
@@ -40,9 +43,11 @@ from rl.directions import (
     towards,
     weights_of,
 )
+from rl.host import join_ranks, leave_ranks, threads_of_rank
 from rl.policy import Policy, as_trained, load_policy, packed_weights, write_policy
 from rl.policy_stack import PolicyStack
 from rl.polish_config import Polish
+from rl.ranks import gathered, own_rank
 from rl.runlog import KINDS, Row, RunLog
 from rl.trials import Share, opened, play_episodes
 from rl.worlds import engine_options, in_own_worlds
@@ -61,7 +66,7 @@ WATCHED_EVERY = 7
 """Steps between those whose observations tell how the last hidden layer varies: no divisor of a
 stride."""
 WATCHED_ROWS = 20_000
-GENERATOR_STEP = 1_000_003
+GENERATOR_STEP, RANK_STEP = 1_000_003, 7919
 SEED_OFFSET = 500_009
 """Added to the seed of the starts, so that those of an evaluation with the same seed are others."""
 
@@ -207,8 +212,22 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
     ``progress.csv`` into the folder, and shows it unless ``quiet``.
 
     The same call goes on where one was stopped. ``options`` are the task's. Returns the rows of
-    this call. Raises PolicyError and ValueError for what does not fit, before anything is written.
+    this call. Under ``torchrun`` the processes share it, and the first one writes. Raises
+    PolicyError and ValueError for what does not fit, before anything is written.
     """
+    began_group = join_ranks("auto" if config.engine == "warp" else "cpu")
+    try:
+        rows = _polish(config, options, quiet)
+    except ValueError:  # every rank has made the same mistake
+        leave_ranks(began_group)
+        raise
+    leave_ranks(began_group)
+    return rows
+
+
+def _polish(config: Polish, options: dict[str, Any] | None, quiet: bool) -> list[Row]:
+    """In one of the processes."""
+    rank, ranks = own_rank()
     wanted = aims(config.objective, config.name)
     policy = load_policy(config.policy, config.name)
     weights_of(policy)  # a baseline has none
@@ -229,12 +248,15 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
             actions = _actions(config, policy)
             changes += shifts(policy, found, config.shift, actions, config.part is None)
         directions, crowd = Directions(weights_of(policy), changes), Crowd(policy, config.blocks)
-        spent.enter(_worlds(config, options))
+        spent.enter(_worlds(config, options, ranks))
 
         def judge(numbers: np.ndarray) -> tuple[np.ndarray, list[Trials]]:
             for slot, row in enumerate(numbers):
                 crowd.write(slot, directions.at(torch.from_numpy(row)))
-            played = [play_episodes(crowd, *ground).trials for ground in grounds]
+            played = [
+                _of_all_ranks(play_episodes(crowd, *ground).trials, config.blocks, env.device)
+                for ground in grounds
+            ]
             values = [worth(x, wanted).reshape(config.blocks, -1).mean(1) for x in played]
             return np.mean(values, 0), played
 
@@ -242,35 +264,52 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
         for _, each in grounds:
             # What went on must not meet the starts of its beginning again.
             each.generator.manual_seed(GENERATOR_STEP * search.generation + share.seed)
-        with closing(RunLog(config.out, [*COLUMNS, *names], search.generation, quiet)) as log:
-            began = time.monotonic()
-            while not config.over(search.generation, spent.minutes):
-                values, played = search.advance(judge)
-                now = time.monotonic()
-                steps = sum(int(trials["episode_steps"].sum()) for trials in played)
-                spent.add((now - began) / 60.0, steps, config.played)
-                began = now
+        log = None
+        if rank == 0:
+            logged = RunLog(config.out, [*COLUMNS, *names], search.generation, quiet)
+            log = stack.enter_context(closing(logged))
+        began = time.monotonic()
+        while not config.over(search.generation, spent.minutes):
+            values, played = search.advance(judge)
+            now = time.monotonic()
+            steps = sum(int(trials["episode_steps"].sum()) for trials in played)
+            # The first process's clock, so that all of them stop together.
+            minutes = gathered(torch.tensor([(now - began) / 60.0], device=env.device).double())
+            spent.add(float(minutes[0]), steps, ranks * config.played)
+            began = now
+            rows.append(
+                {
+                    "iteration": search.generation,
+                    "samples": spent.samples,
+                    "minutes": spent.minutes,
+                    "episodes": spent.episodes,
+                    "middle": float(values[0]),
+                    "candidates": float(values[1:].mean()),
+                    "spread": float(np.exp(np.log(search.spreads).mean())),
+                    **_told(config, played, env.metric_names),
+                }
+            )
+            if log is not None:
                 _save(config, policy, about, directions, search, found, spent)
-                rows.append(
-                    {
-                        "iteration": search.generation,
-                        "samples": spent.samples,
-                        "minutes": spent.minutes,
-                        "episodes": spent.episodes,
-                        "middle": float(values[0]),
-                        "candidates": float(values[1:].mean()),
-                        "spread": float(np.exp(np.log(search.spreads).mean())),
-                        **_told(config, played, env.metric_names),
-                    }
-                )
                 log.write(rows[-1], config.done(search.generation, spent.minutes))
     return rows
+
+
+def _of_all_ranks(trials: Trials, blocks: int, device: torch.device) -> Trials:
+    """Those of every rank, together block by block. ``trials``: this rank's."""
+    if own_rank()[1] == 1:
+        return trials
+    own = torch.from_numpy(np.stack(list(trials.values()))).to(device)
+    every = gathered(own.unflatten(1, (blocks, -1)))  # (R, M, C + 1, E)
+    together = every.permute(1, 2, 0, 3).flatten(1).cpu().numpy()
+    return dict(zip(trials, together))
 
 
 def _share(config: Polish, policy: Policy, options: dict[str, Any] | None) -> Share:
     """The episodes of a generation."""
     athlete = as_trained(policy, config.name, config.strength, config.limits, options)
-    physics = engine_options(config, config.seed)
+    seed = config.seed + RANK_STEP * own_rank()[0]
+    physics = threads_of_rank(config.engine) | engine_options(config, seed)
     if "variation" in physics:
         physics["variation_blocks"] = config.blocks
     return Share(
@@ -278,7 +317,7 @@ def _share(config: Polish, policy: Policy, options: dict[str, Any] | None) -> Sh
         engine=config.engine,
         trials=config.blocks * config.episodes,
         worlds=config.blocks * config.episodes,
-        seed=config.seed + SEED_OFFSET,
+        seed=seed + SEED_OFFSET,
         strength=athlete.strength,
         limits=athlete.limits,
         options=athlete.options,
@@ -348,12 +387,15 @@ def watched(policy: Policy, share: Share, env: Env) -> tuple[Tensor, Tensor]:
 
 
 def _seek(config: Polish, policy: Policy, share: Share, env: Env) -> Phases:
-    """The phases to shift in."""
+    """The phases to shift in; the first rank's, as every rank must shift in the same."""
     obs, gone = watched(policy, share, env)
     if config.part is None:
-        return phases(policy, obs, config.components)
-    begin, end = config.part
-    return phases_of_part(policy, obs, (gone >= begin) & (gone <= end), config.components)
+        found = phases(policy, obs, config.components)
+    else:
+        begin, end = config.part
+        within = (gone >= begin) & (gone <= end)
+        found = phases_of_part(policy, obs, within, config.components)
+    return Phases(gathered(found.middle)[0], gathered(found.axes)[0])
 
 
 def _begin(
@@ -392,12 +434,14 @@ def _about(config: Polish, policy: Policy, others: Sequence[Policy]) -> dict[str
     return json.loads(json.dumps(said | {"of": policy.metadata["sha256"]}))
 
 
-def _worlds(config: Polish, options: dict[str, Any] | None) -> dict[str, Any]:
-    """What the episodes of a call are played in, where it is not the task's own."""
+def _worlds(config: Polish, options: dict[str, Any] | None, ranks: int) -> dict[str, Any]:
+    """What the episodes of a call are played in, where it is not the task's own, and by how many
+    processes."""
     names = ("start_noise", "timestep_divisor", "felt_damping", "vary", "like_drake", "own_worlds")
     told = {name: getattr(config, name) for name in ("engine", *names)} | {"task": options or {}}
     given, usual = vars(config.variation), vars(Variation())
     told["variation"] = {name: x for name, x in given.items() if x != usual[name]}
+    told["processes"] = ranks if ranks > 1 else None
     return json.loads(json.dumps({name: x for name, x in told.items() if x}))
 
 

@@ -19,7 +19,9 @@ class Polish:
 
     CMA-ES moves its weights a little, along a few directions, and keeps what its episodes come to:
     what PPO cannot tell from its noise. Writes policy.safetensors after every generation; the
-    same command goes on where one was stopped.
+    same command goes on where one was stopped. On several GPUs: python -m torch.distributed.run
+    --standalone --nproc-per-node GPUS -m olympics_opt polish TASK ..., and each of them plays
+    --episodes of every candidate.
     """
 
     name: Positional[Annotated[str, arg(metavar="TASK")]]

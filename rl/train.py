@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 from rl import latent_run
 from rl.assembly import Assembly, MakeEnv, assemble, default_env, plays_own
 from rl.checkpoint import CheckpointError
 from rl.config import DEFAULT_SAMPLES, PRIOR, TrainConfig, load_starts, parse_args
-from rl.host import Signals, Stopwatch, join_ranks, one_torch_thread
+from rl.host import Signals, Stopwatch, join_ranks, leave_ranks, one_torch_thread
 from rl.meter import apart
 from rl.profiling import profile_training
 from rl.ranks import over_ranks
@@ -89,16 +88,10 @@ def train(
         trainer = _Trainer(made, on_iteration)
         summary = trainer.profile() if config.profile else trainer.run(part)
     except ValueError:  # every rank has made the same mistake
-        _leave_ranks(began_group)
+        leave_ranks(began_group)
         raise
-    _leave_ranks(began_group)
+    leave_ranks(began_group)
     return summary
-
-
-def _leave_ranks(began: bool) -> None:
-    """Not after an error of one rank: the others would be waited for, and torchrun ends them."""
-    if began:
-        dist.destroy_process_group()
 
 
 class _Trainer:

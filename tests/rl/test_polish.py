@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +24,7 @@ from rl.directions import (
 )
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError, load_policy
-from rl.polish import Aim, Crowd, Search, aims, polish, worth
+from rl.polish import RANK_STEP, Aim, Crowd, Search, aims, polish, worth
 from rl.polish_config import Polish
 from rl.runlog import read_progress
 from rl.trials import Share
@@ -342,3 +344,28 @@ def test_with_own_worlds_half_of_what_counts_is_what_it_is_without_others(tmp_pa
     assert len(polish(replace(on, others=(other,)), quiet=True)) == 1
     with pytest.raises(ValueError, match="no worlds but the task's own"):
         replace(plain, own_worlds=True)
+
+
+def test_processes_share_a_search_each_from_starts_of_its_own(tmp_path: Path):
+    """The middle of the first generation is the policy itself, whose worth two searches of one
+    process each tell of the same starts; the second generation comes of what both have seen."""
+    told = replace(CONFIG, episodes=2, components=-1, others=("pretrained:ppo-human",))
+    alone = [
+        polish(replace(told, seed=seed, generations=1, out=tmp_path / str(seed)), quiet=True)[0]
+        for seed in (0, RANK_STEP)
+    ]
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node"]
+    words = ["2", "-m", "olympics_opt", "polish", "long_jump", "--policy", "pretrained"]
+    words += ["--objective", CONFIG.objective, "--components", "1", "--shift", str(CONFIG.shift)]
+    words += ["--candidates", "4", "--episodes", "2", "--generations", "2"]
+    words += ["--others", "pretrained:ppo-human", "--out", str(tmp_path / "two")]
+    done = subprocess.run([*launch, *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout.count("wrote ") == 1, "the first process tells"
+    rows = read_progress(tmp_path / "two")
+    assert [row["iteration"] for row in rows] == [1, 2]
+    assert [row["episodes"] for row in rows] == [2 * 2 * 5, 2 * 2 * 2 * 5]
+    worths = [float(row["middle"] or np.nan) for row in alone]
+    assert worths[0] != worths[1] and rows[0]["middle"] == pytest.approx(np.mean(worths))
+    card = load_policy(tmp_path / "two" / "policy.safetensors", "long_jump").metadata
+    assert [stage["worlds"]["processes"] for stage in card["polish"]["stages"]] == [2]
