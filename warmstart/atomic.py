@@ -40,8 +40,12 @@ def write_json(path: str | Path, value: Any, indent: int | None = 2) -> Path:
 
 def prepare(path: str | Path) -> Path:
     """Makes the folder of a file that will take long to earn. Raises ValueError for a folder in
-    its place, OSError where nothing can be written."""
+    its place and for the card of weights, without which they are lost, OSError where nothing can be
+    written."""
     path = Path(path)
+    weights = path.with_suffix(".safetensors")
+    if path.suffix == ".json" and weights.is_file():
+        raise ValueError(f"{path} is the card of {weights.name}: give another file to write")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir():
         raise ValueError(f"{path} is a folder, not a file to write")

@@ -6,6 +6,7 @@ import dataclasses
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import torch
 
 from olympics_opt import cli
+from rl import pretrained
 from rl.ppo import PPOConfig
 from sports.registry import task_names
 
@@ -381,6 +383,17 @@ def test_evaluate_survives_no_place_to_write(tmp_path: Path, capsys):
     out = tmp_path / "file" / "result.json"
     line = f"evaluate high_jump --policy zero --trials 1 --out {out}"
     assert "file" in sentence_of(capsys, *line.split())
+
+
+def test_a_result_does_not_take_the_place_of_the_policys_card(tmp_path: Path, capsys):
+    weights = pretrained.locate("long_jump", "ppo")
+    for suffix in (".safetensors", ".json"):
+        shutil.copy(weights.with_suffix(suffix), tmp_path / f"jumper{suffix}")
+    card = (tmp_path / "jumper.json").read_bytes()
+    line = f"evaluate long_jump --policy {tmp_path / 'jumper.safetensors'} --trials 1 --out "
+    said = sentence_of(capsys, *line.split(), str(tmp_path / "jumper.json"))
+    assert "jumper.json is the card of jumper.safetensors" in said
+    assert (tmp_path / "jumper.json").read_bytes() == card
 
 
 def test_a_reader_that_has_seen_enough_is_no_mistake():

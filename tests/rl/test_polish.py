@@ -346,17 +346,32 @@ def test_with_own_worlds_half_of_what_counts_is_what_it_is_without_others(tmp_pa
         replace(plain, own_worlds=True)
 
 
-def test_processes_share_a_search_each_from_starts_of_its_own(tmp_path: Path):
+two_gpus = pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+
+
+@pytest.mark.parametrize("engine", ["mujoco", pytest.param("warp", marks=two_gpus)])
+def test_processes_share_a_search_each_from_starts_of_its_own(tmp_path: Path, engine: str):
     """The middle of the first generation is the policy itself, whose worth two searches of one
     process each tell of the same starts; the second generation comes of what both have seen."""
     told = replace(CONFIG, episodes=2, components=-1, others=("pretrained:ppo-human",))
+    told = replace(told, engine=engine)  # type: ignore[arg-type]
     alone = [
         polish(replace(told, seed=seed, generations=1, out=tmp_path / str(seed)), quiet=True)[0]
         for seed in (0, RANK_STEP)
     ]
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node"]
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
+    launch += ["--local-addr", "127.0.0.1", "--nproc-per-node"]
     words = ["2", "-m", "olympics_opt", "polish", "long_jump", "--policy", "pretrained"]
-    words += ["--objective", CONFIG.objective, "--components", "1", "--shift", str(CONFIG.shift)]
+    words += [
+        "--engine",
+        engine,
+        "--objective",
+        CONFIG.objective,
+        "--components",
+        "1",
+        "--shift",
+        str(CONFIG.shift),
+    ]
     words += ["--candidates", "4", "--episodes", "2", "--generations", "2"]
     words += ["--others", "pretrained:ppo-human", "--out", str(tmp_path / "two")]
     done = subprocess.run([*launch, *words], capture_output=True, text=True)
