@@ -7,6 +7,7 @@ buffers that overflow, rewards or observations of absurd size, and memory that g
 from __future__ import annotations
 
 import multiprocessing
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -198,6 +199,7 @@ def soak_shared(
     gpus = torch.cuda.device_count() if engine == "warp" else 0
     if 0 < gpus < processes:
         raise RuntimeError(f"{processes} processes need a GPU each; here are {gpus}")
+    each = {"threads": max(1, (os.cpu_count() or 1) // processes)} if engine == "mujoco" else None
     shares = [worlds // processes + (i < worlds % processes) for i in range(processes)]
     found: dict[int, Soak] = {}
     context = multiprocessing.get_context("spawn")
@@ -211,6 +213,7 @@ def soak_shared(
                 worlds=share,
                 steps=steps,
                 seed=seed + i,
+                physics_options=each,
                 keep=None if keep is None else keep / f"share_{i}",
                 minutes=minutes,
             ): i
