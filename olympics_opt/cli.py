@@ -44,6 +44,16 @@ class List:
 
 
 @dataclass(frozen=True)
+class Recipe:
+    """Print the commands that a trained policy came from, with every setting, from its card."""
+
+    name: Positional[Annotated[str, arg(metavar="TASK")]]
+    """Sport, or ``tracking`` or ``prior``."""
+    policy: str = "pretrained"
+    """A run folder, a policy file, or ``pretrained[:ALGO[-STRENGTH]]``."""
+
+
+@dataclass(frozen=True)
 class Solve:
     """Optimise a motion, certify it and track it in MuJoCo; or a range of them; or all problems.
 
@@ -405,6 +415,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "polish": Command(Polish, "olympics_opt.polish:run_polish", "task"),
     "export": Command(Export, "olympics_opt.play:run_export"),
+    "recipe": Command(Recipe, "olympics_opt.recipe:run_recipe"),
     "evaluate": Command(Evaluate, "olympics_opt.play:run_evaluate", "task"),
     "verify": Command(Verify, "olympics_opt.verify:run_verify", "task"),
     "render": Command(Render, "olympics_opt.play:run_render", "task"),

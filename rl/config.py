@@ -311,7 +311,8 @@ def config_from_dict(data: dict[str, Any]) -> TrainConfig:
         rivals |= {"ladder": tuple(rivals["ladder"])} if "ladder" in rivals else {}
         data["out"] = Path(data["out"])
         data["clips"] = tuple(Path(p) for p in data["clips"])
-        data["start_probability"] = tuple(data["start_probability"])
+        for name in {"start_probability", "clone_rates"} & set(data):
+            data[name] = tuple(data[name])
         latent = LatentConfig(**data.pop("latent", {}))
         spans: dict[str, Any] = dict(data.pop("variation", {}))
         spans = {name: tuple(x) if isinstance(x, list) else x for name, x in spans.items()}

@@ -1,0 +1,95 @@
+"""``olympics-opt recipe``: the commands that a policy came from."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import textwrap
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from olympics_opt.cli import Recipe
+
+WIDTH = 96
+
+
+def run_recipe(config: Recipe) -> int:
+    """The command. Raises ValueError for a policy that tells nothing of its training."""
+    from rl.recipe import missing, polish_words, train_words
+
+    card = _card(config)
+    words, polished = train_words(card), polish_words(card)
+    print(_facts(card))
+    run = f"runs/{config.name}"
+    print("\n" + _wrapped([*_starter(card), config.name, "--out", run, *words[1:]]))
+    if card.get("averaged"):
+        print(
+            f"\nThe weights are the mean of {len(card['averaged'])} states: train --keep-policies, "
+            "export --mean."
+        )
+    if polished is not None:
+        start = ["olympics-opt", "polish", config.name, "--policy", run, "--out", f"{run}_polished"]
+        episodes = f"{card['polish'].get('episodes', 0):,} episodes"
+        print(f"\nThen, {episodes} in all (say how many with --minutes or --generations):\n")
+        print(_wrapped([*start, *polished[1:]]))
+        if len(card["polish"].get("stages", ())) > 1:
+            print("That was its last stage of several.")
+    if lacking := missing(card):
+        text = f"Not in the project: {', '.join(lacking)}."
+        if lacking[0] == card["config"].get("init"):
+            text += f" To go on from this policy itself, give --init {config.policy} instead."
+        print("\n" + textwrap.fill(text, WIDTH, break_on_hyphens=False))
+    if card.get("history"):
+        print("\n" + textwrap.fill(str(card["history"]), WIDTH, break_on_hyphens=False))
+    return 0
+
+
+def _card(config: Recipe) -> dict[str, Any]:
+    from rl import pretrained
+    from rl.config import PRIOR
+    from rl.policy import load_policy
+
+    if config.name == PRIOR:  # no policy, but trained like one
+        cards = sorted((pretrained.FOLDER / PRIOR).glob("*.safetensors"))
+        if config.policy != "pretrained" or not cards:
+            raise ValueError(f"of '{PRIOR}' only the shipped one has a card: leave --policy out")
+        return pretrained.card(cards[0])
+    return load_policy(config.policy, config.name).metadata
+
+
+def _facts(card: dict[str, Any]) -> str:
+    """In one line, what the last training took."""
+    told = [f"{card['task']}, {card['algo']}, strength {card['strength']}"]
+    if card.get("samples"):
+        told.append(f"{card['samples']:,} samples")
+    if card.get("minutes"):
+        told.append(f"{card['minutes']:.1f} minutes")
+    told += [f"{name} {card[name]}" for name in ("hardware", "commit") if card.get(name)]
+    return textwrap.fill("; ".join(told), WIDTH)
+
+
+def _starter(card: dict[str, Any]) -> list[str]:
+    """One process, or one for each GPU that there was, at least one for each kind of worlds."""
+    found = re.match(r"(\d+) x ", str(card.get("hardware", "")))
+    own = card["config"].get("own_ranks", 0)
+    processes = max(int(found[1]) if found else 1, own + 1)
+    if processes == 1:
+        return ["olympics-opt", "train"]
+    return ["torchrun", "--standalone", "--nproc-per-node", str(processes), "-m", "rl.train"]
+
+
+def _wrapped(words: list[str]) -> str:
+    """For a shell; an option stays with its values unless they fill a line."""
+    parts: list[list[str]] = [[]]
+    for word in words:
+        if word.startswith("--"):
+            parts.append([])
+        parts[-1].append(word)
+    lines = [""]
+    for part in parts:
+        for piece in [part] if len(shlex.join(part)) < WIDTH - 8 else [[word] for word in part]:
+            text = shlex.join(piece)
+            if lines[-1] and len(lines[-1]) + len(text) > WIDTH - 3:
+                lines.append("   ")
+            lines[-1] += f" {text}" if lines[-1] else text
+    return " \\\n".join(lines)

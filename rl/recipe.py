@@ -1,0 +1,120 @@
+"""The command lines that a policy came from, from its card.
+
+A card holds every setting of the training that ended with the policy. What differs from today's
+defaults is written as options; read again (``rl.config.parse_args``), they give the same settings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from rl.config import PRIOR, TrainConfig, config_from_dict, task_options
+from rl.polish_config import Polish
+
+OF_THE_RUN = frozenset(
+    ("task", "out", "resume", "options", "physics_options", "device", "quiet", "profile")
+    + ("checkpoint_minutes", "checkpoint_iterations", "keep_policies")
+)
+"""Settings that change nothing in what is learned."""
+DEMONSTRATIONS = Path(__file__).resolve().parents[1] / "warmstart" / "data"
+
+
+def train_words(card: Mapping[str, Any]) -> list[str]:
+    """``TASK --option value ...``, what ``olympics-opt train`` is told, but for ``--out``.
+
+    Clips that the project holds have their path in it. Raises ValueError for a card without
+    settings, or with some that there are no more.
+    """
+    if not isinstance(card.get("config"), Mapping):
+        raise ValueError("its card holds no settings of a training")
+    told_then = {"out": "", **card["config"]}
+    if told_then.get("task") == PRIOR:  # whose learner is no PPO
+        told_then |= {"algo": "ppo", "ppo": {}}
+    config = config_from_dict(told_then)
+    config = replace(config, clips=tuple(_placed(clip) for clip in config.clips))
+    options = _options(config.task, config.options)
+    plain = TrainConfig(strength=config.strength, limits=config.limits)
+    told = ["--strength", config.strength]
+    told += [] if config.limits == TrainConfig.limits else ["--limits", config.limits]
+    usual = task_options(config.task)()
+    return [config.task, *told, *_words(config, plain), *_words(options, usual, "task.")]
+
+
+def polish_words(card: Mapping[str, Any]) -> list[str] | None:
+    """``TASK --option value ...``, what ``olympics-opt polish`` was told last, but for policies,
+    ``--out`` and how long it took; None for a policy that was not polished. Raises ValueError for
+    settings that there are no more."""
+    search = card.get("polish")
+    if search is None:
+        return None
+    stages = search.get("stages") or [{"worlds": search.get("worlds", {})}]
+    worlds = dict(stages[-1]["worlds"])
+    worlds.pop("processes", None)
+    task = _options(card["task"], worlds.pop("task", {}))
+    # "episodes" are those of the whole search.
+    names = {field.name for field in fields(Polish)} - {"others", "variation", "episodes"}
+    told = {name: _tuple(x) for name, x in (search | worlds).items() if name in names}
+    plain = Polish(name=card["task"], policy="", out=Path(), others=("",), minutes=1.0)
+    try:
+        spans = {name: _tuple(x) for name, x in worlds.get("variation", {}).items()}
+        config = replace(plain, **told, variation=replace(plain.variation, **spans))
+    except TypeError as error:
+        raise ValueError(f"the settings of its polish cannot be read ({error})") from error
+    usual = task_options(card["task"])()
+    return [card["task"], *_words(config, plain), *_words(task, usual, "task.")]
+
+
+def missing(card: Mapping[str, Any]) -> list[str]:
+    """Files that the training began with and the project does not hold."""
+    config = card.get("config") or {}
+    names = [str(_placed(clip)) for clip in config.get("clips", ())]
+    init = config.get("init")
+    if init is not None and not str(init).startswith("pretrained"):
+        names.insert(0, str(init))
+    return [name for name in names if not (DEMONSTRATIONS.parents[1] / name).exists()]
+
+
+def _placed(clip: str | Path) -> Path:
+    """Where the project holds a demonstration of this name, relative to its folder; else the name
+    as it is."""
+    for found in sorted(DEMONSTRATIONS.rglob(Path(clip).name)):
+        return found.relative_to(DEMONSTRATIONS.parents[1])
+    return Path(clip)
+
+
+def _options(task: str, told: Mapping[str, Any]) -> Any:
+    """A task's options; those that a card is too old for have their defaults."""
+    given = {name: _tuple(x) for name, x in told.items()}
+    try:
+        return task_options(task)(**given)
+    except TypeError as error:
+        raise ValueError(f"'{task}' has other options now ({error})") from error
+
+
+def _tuple(x: Any) -> Any:
+    """As it was before it became JSON."""
+    return tuple(x) if isinstance(x, list) else x
+
+
+def _words(value: Any, usual: Any, prefix: str = "") -> list[str]:
+    """Options of the fields that differ from the usual ones."""
+    return list(_each(value, usual, prefix))
+
+
+def _each(value: Any, usual: Any, prefix: str) -> Iterator[str]:
+    for field in fields(value):
+        told, common = getattr(value, field.name), getattr(usual, field.name)
+        if told == common or (not prefix and field.name in OF_THE_RUN):
+            continue
+        name = field.name.replace("_", "-")
+        if dataclasses.is_dataclass(told):
+            yield from _each(told, common, f"{prefix}{name}.")
+        elif isinstance(told, bool):
+            yield f"--{prefix}{'' if told else 'no-'}{name}"
+        else:
+            yield f"--{prefix}{name}"
+            yield from map(str, told) if isinstance(told, tuple) else [str(told)]

@@ -1,0 +1,89 @@
+"""Whether the command that a card is told as gives the settings of the card when it is read."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+
+import pytest
+
+from olympics_opt import cli
+from rl import pretrained
+from rl.config import config_from_dict, parse_args, task_options
+from rl.recipe import OF_THE_RUN, train_words
+
+SHIPPED = [(p["task"], f"{p['name']}-{p['strength']}") for p in pretrained.available()]
+
+
+def told(capsys, *args: str) -> tuple[str, list[list[str]]]:
+    """What ``recipe`` prints, and the words of each command in it."""
+    assert cli.main(["recipe", *args]) == 0
+    text = capsys.readouterr().out
+    lines = text.replace("\\\n", " ").splitlines()
+    return text, [shlex.split(x) for x in lines if x.startswith(("olympics-opt ", "torchrun "))]
+
+
+@pytest.mark.parametrize("task, name", SHIPPED)
+def test_the_commands_of_a_shipped_policy_give_its_settings(task: str, name: str, capsys):
+    card = pretrained.card(pretrained.locate(task, name))
+    text, (train, *polish) = told(capsys, task, "--policy", f"pretrained:{name}")
+    assert max(map(len, text.splitlines())) <= 96
+    begin = 2 if train[0] == "olympics-opt" else train.index("rl.train") + 1
+    read = parse_args(train[begin:])
+    want = config_from_dict({"out": "", **card["config"]})
+    for field in fields(want):
+        if field.name not in OF_THE_RUN | {"clips"}:
+            assert getattr(read, field.name) == getattr(want, field.name), field.name
+    assert [clip.name for clip in read.clips] == [Path(clip).name for clip in want.clips]
+    options = task_options(task)
+    both = [asdict(options(**x)) for x in (read.options, want.options)]
+    assert json.dumps(both[0]) == json.dumps(both[1])  # lists and tuples are alike
+    for clip in read.clips:
+        assert clip.exists() == (clip.name not in text.partition("Not in the project:")[2])
+
+    search = card.get("polish")
+    assert len(polish) == (search is not None)
+    if search is not None:
+        words = [*polish[0][2:], "--generations", "1"]
+        config = cli.parse("polish", cli.COMMANDS["polish"], words)
+        worlds = (search["stages"][-1] if "stages" in search else search)["worlds"]
+        for key, value in (search | worlds).items():
+            if hasattr(config, key) and key not in ("episodes", "others", "task", "variation"):
+                kept = getattr(config, key)
+                assert (list(kept) if isinstance(kept, tuple) else kept) == value, key
+        variation = worlds.get("variation", {})
+        spans = {k: tuple(x) if isinstance(x, list) else x for k, x in variation.items()}
+        assert config.variation == replace(type(config.variation)(), **spans)
+        chosen = cli.chosen_options(config, "task")
+        assert json.loads(json.dumps(chosen)) == worlds.get("task", {})
+
+
+def test_two_kinds_of_worlds_want_two_processes(capsys):
+    text, commands = told(capsys, "hurdling", "--policy", "pretrained:latent-varied")
+    assert commands[0][:4] == ["torchrun", "--standalone", "--nproc-per-node", "2"]
+    assert "mean of 3 states" in text and "253,952 episodes" in text
+
+
+def test_the_prior_has_a_recipe_too(capsys):
+    text, commands = told(capsys, "prior")
+    assert parse_args(commands[0][2:]).tracker == "pretrained" and "distilled" in text
+
+
+def test_what_tells_nothing_of_its_training_is_refused(capsys):
+    for line, said in (
+        ("long_jump --policy zero", "no settings of a training"),
+        ("long_jump --policy nowhere", "no policy 'nowhere'"),
+        ("prior --policy zero", "leave --policy out"),
+    ):
+        assert cli.main(["recipe", *line.split()]) == 2
+        assert said in capsys.readouterr().err
+    with pytest.raises(ValueError, match="other options now"):
+        train_words({"config": {**_config(), "options": {"wings": 2}}})
+    with pytest.raises(ValueError, match="settings cannot be read"):
+        train_words({"config": {**_config(), "wings": 2}})
+
+
+def _config() -> dict:
+    return pretrained.card(pretrained.locate("long_jump", "ppo"))["config"]
