@@ -75,12 +75,15 @@ def missing(card: Mapping[str, Any]) -> list[str]:
     init = config.get("init")
     if init is not None and not str(init).startswith("pretrained"):
         names.insert(0, str(init))
-    return [name for name in names if not (DEMONSTRATIONS.parents[1] / name).exists()]
+    here = DEMONSTRATIONS.parents[1]
+    return [name for name in names if not ((here / name).exists() or Path(name).exists())]
 
 
 def _placed(clip: str | Path) -> Path:
-    """Where the project holds a demonstration of this name, relative to its folder; else the name
-    as it is."""
+    """Where the project holds a demonstration of this name, relative to its folder; else, and where
+    a folder is told, the name as it is."""
+    if Path(clip).name != str(clip):
+        return Path(clip)
     for found in sorted(DEMONSTRATIONS.rglob(Path(clip).name)):
         return found.relative_to(DEMONSTRATIONS.parents[1])
     return Path(clip)
