@@ -6,6 +6,7 @@ buffers that overflow, rewards or observations of absurd size, and memory that g
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import time
@@ -28,6 +29,8 @@ SIGMA = 0.3
 """Of the random actions: more than a fresh policy's, so that the athletes thrash about."""
 ACTIONS = 64
 """Different actions for each world, in turn."""
+KEPT_MINUTES = 5.0
+"""Between the states that are kept of a run: what a kill may cost."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,8 @@ def soak(
         seed: of actions and starts.
         physics_options: of the engine.
         on_step: called with the number of steps taken, now and then.
-        keep: folder in which the worlds are kept at the end; the same call goes on with them.
+        keep: folder in which the worlds are kept every few minutes and at the end; the same call
+            goes on with them.
         minutes: time limit of this call; its ``steps`` are those taken until then, by all calls.
 
     Raises:
@@ -130,9 +134,14 @@ def soak(
         generator = torch.Generator(env.device).manual_seed(seed)
         shape = (ACTIONS, worlds, env.num_agents, env.action_size)
         actions = SIGMA * torch.randn(shape, generator=generator, device=env.device)
-        _play(env, actions, tally, steps, minutes, on_step)
-        if keep is not None:
-            save_checkpoint(keep, tally.step, {"soak": about | asdict(tally)}, env.state_dict())
+        began, limit = time.perf_counter(), math.inf if minutes is None else 60.0 * minutes
+        left = limit
+        while left > 0.0 and tally.step < steps:
+            _play(env, actions, tally, steps, min(left, 60.0 * KEPT_MINUTES), on_step)
+            if keep is not None:
+                state = {"soak": about | asdict(tally)}
+                save_checkpoint(keep, tally.step, state, env.state_dict())
+            left = limit - (time.perf_counter() - began)
         late = _device_gib(env)
         return Soak(
             task=task,
@@ -277,14 +286,16 @@ def _play(
     actions: Tensor,
     tally: Tally,
     steps: int,
-    minutes: float | None,
+    seconds: float,
     on_step: Callable[[int], None] | None,
 ) -> None:
-    """Plays until ``steps`` and adds to the tally."""
+    """Plays until ``steps``, or for so many seconds, and adds to the tally."""
     # Of numbers: not finite in features and rewards; of worlds: ended.
     counts = torch.zeros(3, dtype=torch.long, device=env.device)
     largest = torch.zeros(2, device=env.device)
     mark, began = max(1, steps // 100), time.perf_counter()
+    nan_worlds, overflow = int(env.physics.nan_worlds), int(env.physics.overflow)
+    overflows = Counter(env.physics.overflows())
     while tally.step < steps:
         result = env.step(actions[tally.step % len(actions)])
         # The environment removes NaN from its observations; here they are looked for.
@@ -305,7 +316,7 @@ def _play(
             if on_step is not None:
                 on_step(tally.step)
             largest.tolist()  # waits for the device: steps that are only queued take no time
-            if minutes is not None and time.perf_counter() - began >= 60.0 * minutes:
+            if time.perf_counter() - began >= seconds:
                 break
     bad_observations, bad_rewards, episodes = counts.tolist()
     tally.bad_observations += bad_observations
@@ -314,9 +325,10 @@ def _play(
     sizes = largest.tolist()
     tally.largest_observation = max(tally.largest_observation, sizes[0])
     tally.largest_reward = max(tally.largest_reward, sizes[1])
-    tally.nan_worlds += int(env.physics.nan_worlds)
-    tally.overflow += int(env.physics.overflow)
-    tally.overflows = dict(Counter(tally.overflows) + Counter(env.physics.overflows()))
+    tally.nan_worlds += int(env.physics.nan_worlds) - nan_worlds
+    tally.overflow += int(env.physics.overflow) - overflow
+    more = Counter(env.physics.overflows()) - overflows
+    tally.overflows = dict(Counter(tally.overflows) + more)
     tally.seconds += time.perf_counter() - began
 
 

@@ -15,8 +15,9 @@ import torch
 from olympics_opt import bench
 from olympics_opt.meter import Meter, measure, summary
 from olympics_opt.soak import soak, soak_shared
+from rl.checkpoint import checkpoints
 from rl.ppo import PPOConfig
-from sports.env import make_env
+from sports.env import Env, make_env
 from sports.humanoid.mjcf import build_model
 
 SMALL = PPOConfig(hidden=(16,), steps=6, minibatches=2, epochs=1)
@@ -196,6 +197,34 @@ def test_an_endurance_run_in_two_goes_is_the_same_as_in_one(tmp_path: Path) -> N
     assert short.steps == 100  # looked at each hundredth
     with pytest.raises(ValueError, match="minutes"):
         soak("long_jump", "mujoco", worlds=3, minutes=0.0)
+
+
+def test_an_endurance_run_that_is_killed_has_kept_its_worlds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A step of every world is said to diverge, so that what is counted twice shows."""
+    step = Env.step
+
+    def diverging(env: Env, action: torch.Tensor):
+        result = step(env, action)
+        env.physics.nan_worlds += 1
+        if kills and env.physics.nan_worlds == 70:
+            raise KeyboardInterrupt
+        return result
+
+    monkeypatch.setattr(Env, "step", diverging)
+    kills = False
+    whole = soak("long_jump", "mujoco", worlds=3, steps=100)
+    monkeypatch.setattr("olympics_opt.soak.KEPT_MINUTES", 1e-9)  # after each hundredth
+    kills, keep = True, tmp_path / "worlds"
+    with pytest.raises(KeyboardInterrupt):
+        soak("long_jump", "mujoco", worlds=3, steps=100, keep=keep)
+    assert [path.name for path in checkpoints(keep)] == ["step_0000068", "step_0000069"]
+    kills = False
+    both = soak("long_jump", "mujoco", worlds=3, steps=100, keep=keep)
+    assert both.nan_worlds == whole.nan_worlds == 100
+    for name in ("episodes", "largest_observation", "largest_reward"):
+        assert getattr(both, name) == getattr(whole, name), name
 
 
 def test_an_endurance_run_shared_out_is_the_sum_of_its_shares(tmp_path: Path) -> None:
