@@ -51,10 +51,11 @@ from rl.ranks import gathered, own_rank
 from rl.runlog import KINDS, Row, RunLog
 from rl.trials import Share, opened, play_episodes
 from rl.worlds import engine_options, in_own_worlds
-from sports.env import Env
+from sports.env import Env, Starts
 from sports.humanoid.body import load_body
 from sports.physics.variation import Variation
 from sports.registry import get_task
+from sports.starts import ELAPSED, loose_joints
 from warmstart.evolution import strategy
 from warmstart.npz import read_npz, write_npz
 
@@ -249,6 +250,10 @@ def _polish(config: Polish, options: dict[str, Any] | None, quiet: bool) -> list
             changes += shifts(policy, found, config.shift, actions, config.part is None)
         directions, crowd = Directions(weights_of(policy), changes), Crowd(policy, config.blocks)
         spent.enter(_worlds(config, options, ranks))
+        if config.begin is not None:
+            starts = met(policy, share, env, config.begin)
+            for _, each in grounds:
+                each.starts = starts
 
         def judge(numbers: np.ndarray) -> tuple[np.ndarray, list[Trials]]:
             for slot, row in enumerate(numbers):
@@ -386,6 +391,44 @@ def watched(policy: Policy, share: Share, env: Env) -> tuple[Tensor, Tensor]:
     return rows[::every], gone[::every]
 
 
+def met(policy: Policy, share: Share, env: Env, part: tuple[float, float]) -> Starts:
+    """States that the policy comes to in this part of its episodes (shares of the longest), as
+    starts with the share's noise of the joints. Raises ValueError where no episode lasts so long.
+    """
+    scene = env.physics.scene
+    q, v, free = scene.agent_qpos(0), scene.agent_qvel(0), len(scene.free_objects)
+    low, high = (round(x * env.max_steps) for x in part)
+    seen: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def probe(obs: Tensor) -> Tensor:
+        clock = env.view.clock
+        here = (clock >= low) & (clock <= high)
+        seconds = clock[here] * env.view.control_timestep
+        seen.append((env.physics.qpos[here], env.physics.qvel[here], seconds))
+        return policy(obs)
+
+    play_episodes(probe, share, env)
+    qpos, qvel, seconds = (torch.cat(x) for x in zip(*seen, strict=True))
+    if not len(qpos):
+        raise ValueError(f"no episode lasts until {part[0]:.0%} of the longest: begin earlier")
+    every = max(1, len(qpos) // WATCHED_ROWS)
+    qpos, qvel, seconds = qpos[::every].clone(), qvel[::every].clone(), seconds[::every]
+    generator = torch.Generator().manual_seed(share.seed)
+    draw = 2.0 * torch.rand(qpos[:, q][:, 7:].shape, generator=generator) - 1.0
+    noise = share.start_noise * loose_joints(scene, torch.device("cpu")) * draw
+    athlete = qpos[:, q]
+    athlete[:, 7:] += noise.to(env.device)
+    return Starts(
+        athlete,
+        qvel[:, v],
+        {ELAPSED: seconds},
+        probability=1.0,
+        object_qpos=qpos[:, -7 * free :] if free else None,
+        object_qvel=qvel[:, -6 * free :] if free else None,
+        blocks=share.blocks,
+    )
+
+
 def _seek(config: Polish, policy: Policy, share: Share, env: Env) -> Phases:
     """The phases to shift in; the first rank's, as every rank must shift in the same."""
     obs, gone = watched(policy, share, env)
@@ -441,7 +484,7 @@ def _worlds(config: Polish, options: dict[str, Any] | None, ranks: int) -> dict[
     told = {name: getattr(config, name) for name in ("engine", *names)} | {"task": options or {}}
     given, usual = vars(config.variation), vars(Variation())
     told["variation"] = {name: x for name, x in given.items() if x != usual[name]}
-    told["processes"] = ranks if ranks > 1 else None
+    told |= {"processes": ranks if ranks > 1 else None, "begin": config.begin}
     return json.loads(json.dumps({name: x for name, x in told.items() if x}))
 
 

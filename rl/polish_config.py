@@ -43,6 +43,11 @@ class Polish:
     """Shift in this part of the episodes above all (its begin and end, as shares of the longest
     episode), in step with what tells it from the rest, and nowhere always. A race that is lost at
     its last hurdles is better left alone before."""
+    begin: tuple[float, float] | None = None
+    """Episodes begin in states that the policy itself comes to in this part of them (shares of the
+    longest one), with the noise of ``start_noise``: a race that is lost at its last hurdle is
+    judged by its end alone, in a fifth of the time. The rules begin anew there: what was achieved
+    before does not count."""
     joints: tuple[str, ...] = ()
     """Shift these alone, by name (``R_Shoulder_*``, ``Torso_?``); by default every action. What a
     throw needs is in the trunk and one arm, not in 153 joints."""
@@ -96,6 +101,8 @@ class Polish:
                 raise ValueError(f"a part of the episodes is two shares of it, not {self.part}")
             if self.components < 1:
                 raise ValueError("a part of the episodes needs --components of 1 or more")
+        if self.begin is not None and not 0.0 <= self.begin[0] <= self.begin[1] <= 1.0:
+            raise ValueError(f"episodes begin between two shares of the longest, not {self.begin}")
         if not 0.0 <= self.start_noise < 1.0:
             raise ValueError(f"the starts' noise must lie in [0, 1) rad, not {self.start_noise}")
         if self.shift <= 0.0 or self.share <= 0.0:

@@ -24,11 +24,11 @@ from rl.directions import (
 )
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError, load_policy
-from rl.polish import RANK_STEP, Aim, Crowd, Search, aims, polish, worth
+from rl.polish import RANK_STEP, Aim, Crowd, Search, aims, met, polish, worth
 from rl.polish_config import Polish
 from rl.runlog import read_progress
-from rl.trials import Share
-from sports.env import Env
+from rl.trials import Share, play_episodes
+from sports.env import Env, make_env
 from sports.humanoid.body import load_body
 from sports.physics.variation import Variation
 
@@ -131,6 +131,49 @@ def test_a_part_is_told_by_the_clock_of_each_episode(tmp_path: Path):
     # An episode of a long jump is over long before its last tenth.
     with pytest.raises(ValueError, match="something in it"):
         polish(replace(config, part=(0.99, 1.0), out=tmp_path / "late"), quiet=True)
+
+
+def test_episodes_begin_where_the_policy_is_in_a_part_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Without noise every start is what 33 steps of the policy lead to, clock and all."""
+    policy = load_policy(CONFIG.policy, CONFIG.name)
+    env = make_env(CONFIG.name, num_worlds=1, training=False)
+    obs = env.reset()
+    for _ in range(33):
+        obs = env.step(policy(obs)).obs
+    qpos, qvel, at = env.physics.qpos[0].clone(), env.physics.qvel[0].clone(), 33 / env.max_steps
+    env.close()
+    begun: list[Env] = []
+
+    def play(policy, share: Share, env: Env, report=None):
+        if env.starts is not None:
+            env.reset()
+            assert (env.physics.qpos - qpos).abs().max() < 1e-4
+            assert (env.physics.qvel - qvel).abs().max() < 1e-3
+            assert (env.view.clock == 33).all()
+            begun.append(env)
+        return play_episodes(policy, share, env, report)
+
+    monkeypatch.setattr("rl.polish.play_episodes", play)
+    config = replace(CONFIG, begin=(at, at), start_noise=0.0, generations=1)
+    whole = polish(replace(config, begin=None, out=tmp_path / "whole"), quiet=True)[0]
+    late = polish(replace(config, out=tmp_path / "late"), quiet=True)[0]
+    assert len(begun) == 1
+    assert late["middle"] == pytest.approx(whole["middle"], abs=0.02)  # it lands where it did
+    assert float(late["samples"] or 0) < float(whole["samples"] or 0) - 5 * 20
+    card = load_policy(tmp_path / "late" / "policy.safetensors", "long_jump").metadata
+    assert card["polish"]["stages"][0]["worlds"]["begin"] == [at, at]
+    common = {"engine": "mujoco", "trials": 2, "worlds": 2, "seed": 0, "options": {}}
+    share = Share(CONFIG.name, strength="paper", limits="paper", start_noise=0.05, **common)
+    env = make_env(CONFIG.name, num_worlds=2, training=False)
+    noisy = met(policy, share, env, (at, at))
+    env.close()
+    moved = (noisy.qpos - qpos)[:, 7:].abs()
+    assert 0.03 < float(moved.max()) < 0.051
+    assert (noisy.qvel - qvel).abs().max() < 1e-3
+    with pytest.raises(ValueError, match="begin earlier"):
+        polish(replace(config, begin=(0.99, 1.0), out=tmp_path / "never"), quiet=True)
 
 
 def test_everyone_in_a_crowd_plays_in_its_own_block():
@@ -241,6 +284,7 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path):
         ({"start_noise": -0.1}, "noise"),
         ({"part": (0.8, 0.2)}, "two shares"),
         ({"part": (0.8, 0.9), "components": 0}, "--components of 1"),
+        ({"begin": (0.8, 1.2)}, "begin between two shares"),
         ({"variation": Variation(uneven=0.1)}, "--vary as well"),
         ({"vary": True, "engine": "drake"}, "drake has worlds of its own"),
         ({"joints": ("R_*",), "components": -1, "others": ("zero",)}, "--joints"),
