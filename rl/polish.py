@@ -393,8 +393,11 @@ def watched(policy: Policy, share: Share, env: Env) -> tuple[Tensor, Tensor]:
 
 def met(policy: Policy, share: Share, env: Env, part: tuple[float, float]) -> Starts:
     """States that the policy comes to in this part of its episodes (shares of the longest), as
-    starts with the share's noise of the joints. Raises ValueError where no episode lasts so long.
+    starts with the share's noise of the joints. Raises ValueError where no episode lasts so long,
+    and for more than one athlete.
     """
+    if env.num_agents > 1:
+        raise ValueError("who has an opponent begins with it: leave --begin out")
     scene = env.physics.scene
     q, v, free = scene.agent_qpos(0), scene.agent_qvel(0), len(scene.free_objects)
     low, high = (round(x * env.max_steps) for x in part)

@@ -174,6 +174,10 @@ def test_episodes_begin_where_the_policy_is_in_a_part_of_them(
     assert (noisy.qvel - qvel).abs().max() < 1e-3
     with pytest.raises(ValueError, match="begin earlier"):
         polish(replace(config, begin=(0.99, 1.0), out=tmp_path / "never"), quiet=True)
+    duel = {"name": "boxing", "policy": "pretrained:selfplay", "objective": "success=1"}
+    with pytest.raises(ValueError, match="opponent"):
+        polish(replace(config, out=tmp_path / "never", **duel), quiet=True)
+    assert not (tmp_path / "never").exists()
 
 
 def test_everyone_in_a_crowd_plays_in_its_own_block():
