@@ -12,7 +12,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,8 @@ SIGMA = 0.3
 """Of the random actions: more than a fresh policy's, so that the athletes thrash about."""
 ACTIONS = 64
 """Different actions for each world, in turn."""
+LOOK_SECONDS = 0.5
+"""Between two looks at how far several processes have come."""
 KEPT_MINUTES = 5.0
 """Between the states that are kept of a run: what a kill may cost."""
 
@@ -185,10 +187,11 @@ def soak_shared(
     engine needs one.
 
     Every process has its own seed, from ``seed`` on. ``keep`` gets a folder of each; ``on_step`` is
-    called with ``steps`` as each of them ends.
+    called with the mean of their steps.
 
     Raises:
-        ValueError: as :func:`soak`; fewer worlds than processes, no process.
+        ValueError: as :func:`soak`; fewer worlds than processes, no process, or a folder that keeps
+            the shares of another number of them.
         CheckpointError: as :func:`soak`.
         RuntimeError: as :func:`soak`; fewer GPUs than processes.
     """
@@ -208,14 +211,19 @@ def soak_shared(
     gpus = torch.cuda.device_count() if engine == "warp" else 0
     if 0 < gpus < processes:
         raise RuntimeError(f"{processes} processes need a GPU each; here are {gpus}")
+    if keep is not None and (there := len(list(keep.glob("share_*")))) not in (0, processes):
+        raise ValueError(f"'{keep}' keeps the shares of {there} processes, not of {processes}")
     each = {"threads": max(1, (os.cpu_count() or 1) // processes)} if engine == "mujoco" else None
     shares = [worlds // processes + (i < worlds % processes) for i in range(processes)]
-    found: dict[int, Soak] = {}
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context) as pool:
-        futures = {
+    taken = context.Array("q", processes)
+    with ProcessPoolExecutor(
+        processes, mp_context=context, initializer=_count_in, initargs=(taken,)
+    ) as pool:
+        futures = [
             pool.submit(
                 _soak_share,
+                i,
                 i if gpus else None,
                 task,
                 engine,
@@ -225,22 +233,34 @@ def soak_shared(
                 physics_options=each,
                 keep=None if keep is None else keep / f"share_{i}",
                 minutes=minutes,
-            ): i
+            )
             for i, share in enumerate(shares)
-        }
-        for future in as_completed(futures):
-            found[futures[future]] = future.result()
+        ]
+        while wait(futures, timeout=LOOK_SECONDS).not_done:
             if on_step is not None:
-                on_step(steps * len(found) // processes)
-    return together([found[i] for i in range(processes)])
+                on_step(sum(taken[:]) // processes)
+    return together([future.result() for future in futures])
 
 
-def _soak_share(gpu: int | None, task: str, engine: str, **options: Any) -> Soak:
-    """In a process of its own: its share of the worlds, on its GPU."""
+_taken: Any = None
+"""In a process of ``soak_shared``: how many steps each of them has taken."""
+
+
+def _count_in(taken: Any) -> None:
+    global _taken
+    _taken = taken
+
+
+def _soak_share(i: int, gpu: int | None, task: str, engine: str, **options: Any) -> Soak:
+    """In a process of its own: share ``i`` of the worlds, on its GPU."""
     torch.set_num_threads(1)
     if gpu is not None:
         torch.cuda.set_device(gpu)
-    return soak(task, engine, **options)
+
+    def count(step: int) -> None:
+        _taken[i] = step
+
+    return soak(task, engine, on_step=count, **options)
 
 
 def together(shares: Sequence[Soak]) -> Soak:

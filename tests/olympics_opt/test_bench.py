@@ -227,8 +227,14 @@ def test_an_endurance_run_that_is_killed_has_kept_its_worlds(
         assert getattr(both, name) == getattr(whole, name), name
 
 
-def test_an_endurance_run_shared_out_is_the_sum_of_its_shares(tmp_path: Path) -> None:
-    shared = soak_shared("long_jump", "mujoco", worlds=5, processes=2, steps=90, seed=3)
+def test_an_endurance_run_shared_out_is_the_sum_of_its_shares(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[int] = []
+    common = {"worlds": 5, "processes": 2, "steps": 90, "seed": 3, "on_step": seen.append}
+    monkeypatch.setattr("olympics_opt.soak.LOOK_SECONDS", 0.01)
+    shared = soak_shared("long_jump", "mujoco", **common)
+    assert seen == sorted(seen) and any(0 < step < 90 for step in seen)
     shares = [
         soak("long_jump", "mujoco", worlds=3, steps=90, seed=3),
         soak("long_jump", "mujoco", worlds=2, steps=90, seed=4),
@@ -241,6 +247,8 @@ def test_an_endurance_run_shared_out_is_the_sum_of_its_shares(tmp_path: Path) ->
     two = {"worlds": 5, "processes": 2, "seed": 3, "keep": tmp_path / "worlds"}
     assert soak_shared("long_jump", "mujoco", steps=50, **two).steps == 50
     assert soak_shared("long_jump", "mujoco", steps=90, **two).episodes == shared.episodes
+    with pytest.raises(ValueError, match="the shares of 2 processes, not of 3"):
+        soak_shared("long_jump", "mujoco", **{**two, "processes": 3})
     for count in (0, 6):
         with pytest.raises(ValueError, match="cannot be shared out"):
             soak_shared("long_jump", "mujoco", worlds=5, processes=count)
