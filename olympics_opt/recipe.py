@@ -21,7 +21,7 @@ def run_recipe(config: Recipe) -> int:
     words, polished = train_words(card), polish_words(card)
     print(_facts(card))
     run = f"runs/{config.name}"
-    print("\n" + _wrapped([*_starter(card), config.name, "--out", run, *words[1:]]))
+    print("\n" + _wrapped([*_starter(card), config.name, "--out", run, *words]))
     if card.get("averaged"):
         print(
             f"\nThe weights are the mean of {len(card['averaged'])} states: train --keep-policies, "
@@ -31,7 +31,7 @@ def run_recipe(config: Recipe) -> int:
         start = ["olympics-opt", "polish", config.name, "--policy", run, "--out", f"{run}_polished"]
         episodes = f"{card['polish'].get('episodes', 0):,} episodes"
         print(f"\nThen, {episodes} in all (say how many with --minutes or --generations):\n")
-        print(_wrapped([*start, *polished[1:]]))
+        print(_wrapped([*start, *polished]))
         if len(card["polish"].get("stages", ())) > 1:
             print("That was its last stage of several.")
     if lacking := missing(card):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from olympics_opt.meter import device_name, resident_gib
 from rl.checkpoint import checkpoints, load_checkpoint, save_checkpoint
+from rl.host import threads_of_each
 from sports.env import Env, make_env
 
 STEPS = 10_000
@@ -213,7 +213,6 @@ def soak_shared(
         raise RuntimeError(f"{processes} processes need a GPU each; here are {gpus}")
     if keep is not None and (there := len(list(keep.glob("share_*")))) not in (0, processes):
         raise ValueError(f"'{keep}' keeps the shares of {there} processes, not of {processes}")
-    each = {"threads": max(1, (os.cpu_count() or 1) // processes)} if engine == "mujoco" else None
     shares = [worlds // processes + (i < worlds % processes) for i in range(processes)]
     context = multiprocessing.get_context("spawn")
     taken = context.Array("q", processes)
@@ -230,7 +229,7 @@ def soak_shared(
                 worlds=share,
                 steps=steps,
                 seed=seed + i,
-                physics_options=each,
+                physics_options=threads_of_each(engine, processes),
                 keep=None if keep is None else keep / f"share_{i}",
                 minutes=minutes,
             )

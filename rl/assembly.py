@@ -24,7 +24,7 @@ from rl.config import (
     load_placed_starts,
     load_starts,
 )
-from rl.host import pick_device, threads_of_rank
+from rl.host import RANK_STEP, local_ranks, pick_device, threads_of_each
 from rl.meter import EpisodeMeter
 from rl.parts import ImitationReward, Impacts, Lesson, Opponents, Part, Style
 from rl.policy import read_policy
@@ -110,7 +110,7 @@ def assemble(config: TrainConfig, starts: Starts | None, make: MakeEnv) -> Assem
     first = None if resumed else config.init
     if first:
         config = _shaped_like(config, first)
-    env = make(of_rank(config, rank, ranks), config.seed + 7919 * rank)
+    env = make(of_rank(config, rank, ranks), config.seed + RANK_STEP * rank)
     if starts is None:
         starts = _starts_of_clips(config)
     if starts is not None:
@@ -181,7 +181,7 @@ def plays_own(config: TrainConfig, rank: int, ranks: int) -> bool:
 
 def default_env(config: TrainConfig, seed: int) -> Env:
     """The config's task on its engine, in training mode."""
-    physics_options = threads_of_rank(config.engine) | config.physics_options
+    physics_options = threads_of_each(config.engine, local_ranks()) | config.physics_options
     physics_options |= engine_options(config, seed)
     if config.task == PRIOR:
         from rl.distillation import make_distillation_env

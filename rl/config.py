@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -297,6 +297,11 @@ def load_placed_starts(paths: tuple[Path, ...], probability: float) -> Starts | 
     return load_starts(placed, probability) if placed else None
 
 
+def with_tuples(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings from JSON, which has no tuples: its lists were some."""
+    return {name: tuple(x) if isinstance(x, list) else x for name, x in data.items()}
+
+
 def config_from_dict(data: dict[str, Any]) -> TrainConfig:
     """A TrainConfig from its JSON. Raises ValueError where it is not one."""
     try:
@@ -311,11 +316,11 @@ def config_from_dict(data: dict[str, Any]) -> TrainConfig:
         rivals |= {"ladder": tuple(rivals["ladder"])} if "ladder" in rivals else {}
         data["out"] = Path(data["out"])
         data["clips"] = tuple(Path(p) for p in data["clips"])
-        for name in {"start_probability", "clone_rates"} & set(data):
-            data[name] = tuple(data[name])
+        data["start_probability"] = tuple(data["start_probability"])
+        if "clone_rates" in data:  # none in runs of versions without it
+            data["clone_rates"] = tuple(data["clone_rates"])
         latent = LatentConfig(**data.pop("latent", {}))
-        spans: dict[str, Any] = dict(data.pop("variation", {}))
-        spans = {name: tuple(x) if isinstance(x, list) else x for name, x in spans.items()}
+        spans = with_tuples(data.pop("variation", {}))
         how = {"ppo": PPOConfig(**ppo), "amp": AMPConfig(**amp), "latent": latent}
         vary = Variation(**spans)
         return TrainConfig(**data, **how, variation=vary, selfplay=SelfPlayConfig(**rivals))

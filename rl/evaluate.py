@@ -21,6 +21,7 @@ import torch
 from scipy import stats
 
 from rl import provenance
+from rl.host import RANK_STEP
 from rl.policy import Policy, as_trained, load_policy
 from rl.recording import Recording
 from rl.trials import Played, Share, play_share, ranked, standing_starts
@@ -130,7 +131,7 @@ def evaluate(
             engine=engine,
             trials=size,
             worlds=worlds,
-            seed=seed + 7919 * i,
+            seed=seed + RANK_STEP * i,
             strength=strength,
             limits=limits,
             options=options,

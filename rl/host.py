@@ -12,6 +12,9 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
+RANK_STEP = 7919
+"""The seeds of processes that play side by side are so far apart."""
+
 
 class Signals:
     """SIGTERM and SIGINT ask the loop to save and stop; a second SIGINT interrupts at once."""
@@ -104,18 +107,29 @@ def join_ranks(device: str = "auto", share: bool = False) -> bool:
     return True
 
 
-def leave_ranks(began: bool) -> None:
-    """What ``join_ranks`` began. Not after an error of one rank: the others would be waited for,
-    and torchrun ends them."""
+@contextmanager
+def among_ranks(device: str = "auto", share: bool = False) -> Iterator[None]:
+    """``join_ranks``, and leaves what it joined, but for an error of one rank alone: the others
+    would be waited for, and torchrun ends them. A ValueError is a mistake that all have made."""
+    began = join_ranks(device, share)
+    try:
+        yield
+    except ValueError:
+        _leave_ranks(began)
+        raise
+    _leave_ranks(began)
+
+
+def _leave_ranks(began: bool) -> None:
     if began:
         dist.destroy_process_group()
 
 
-def threads_of_rank(engine: str) -> dict[str, int]:
-    """Options of an engine on the CPU that share the processors out among the ranks here."""
-    if engine != "mujoco" or local_ranks() == 1:
+def threads_of_each(engine: str, processes: int) -> dict[str, int]:
+    """Options of an engine on the CPU that share the processors out among processes."""
+    if engine != "mujoco" or processes == 1:
         return {}
-    return {"threads": max(1, (os.cpu_count() or 1) // local_ranks())}
+    return {"threads": max(1, (os.cpu_count() or 1) // processes)}
 
 
 def local_ranks() -> int:

@@ -43,19 +43,19 @@ from rl.directions import (
     towards,
     weights_of,
 )
-from rl.host import join_ranks, leave_ranks, threads_of_rank
+from rl.host import RANK_STEP, among_ranks, local_ranks, threads_of_each
 from rl.policy import Policy, as_trained, load_policy, packed_weights, write_policy
 from rl.policy_stack import PolicyStack
 from rl.polish_config import Polish
 from rl.ranks import gathered, own_rank
 from rl.runlog import KINDS, Row, RunLog
-from rl.trials import Share, opened, play_episodes
+from rl.trials import Share, opened, play_episodes, shaken
 from rl.worlds import engine_options, in_own_worlds
 from sports.env import Env, Starts
 from sports.humanoid.body import load_body
 from sports.physics.variation import Variation
 from sports.registry import get_task
-from sports.starts import ELAPSED, loose_joints
+from sports.starts import ELAPSED
 from warmstart.evolution import strategy
 from warmstart.npz import read_npz, write_npz
 
@@ -67,7 +67,7 @@ WATCHED_EVERY = 7
 """Steps between those whose observations tell how the last hidden layer varies: no divisor of a
 stride."""
 WATCHED_ROWS = 20_000
-GENERATOR_STEP, RANK_STEP = 1_000_003, 7919
+GENERATOR_STEP = 1_000_003
 SEED_OFFSET = 500_009
 """Added to the seed of the starts, so that those of an evaluation with the same seed are others."""
 
@@ -216,14 +216,8 @@ def polish(config: Polish, options: dict[str, Any] | None = None, quiet: bool = 
     this call. Under ``torchrun`` the processes share it, and the first one writes. Raises
     PolicyError and ValueError for what does not fit, before anything is written.
     """
-    began_group = join_ranks("auto" if config.engine == "warp" else "cpu")
-    try:
-        rows = _polish(config, options, quiet)
-    except ValueError:  # every rank has made the same mistake
-        leave_ranks(began_group)
-        raise
-    leave_ranks(began_group)
-    return rows
+    with among_ranks("auto" if config.engine == "warp" else "cpu"):
+        return _polish(config, options, quiet)
 
 
 def _polish(config: Polish, options: dict[str, Any] | None, quiet: bool) -> list[Row]:
@@ -314,7 +308,7 @@ def _share(config: Polish, policy: Policy, options: dict[str, Any] | None) -> Sh
     """The episodes of a generation."""
     athlete = as_trained(policy, config.name, config.strength, config.limits, options)
     seed = config.seed + RANK_STEP * own_rank()[0]
-    physics = threads_of_rank(config.engine) | engine_options(config, seed)
+    physics = threads_of_each(config.engine, local_ranks()) | engine_options(config, seed)
     if "variation" in physics:
         physics["variation_blocks"] = config.blocks
     return Share(
@@ -415,14 +409,9 @@ def met(policy: Policy, share: Share, env: Env, part: tuple[float, float]) -> St
     if not len(qpos):
         raise ValueError(f"no episode lasts until {part[0]:.0%} of the longest: begin earlier")
     every = max(1, len(qpos) // WATCHED_ROWS)
-    qpos, qvel, seconds = qpos[::every].clone(), qvel[::every].clone(), seconds[::every]
-    generator = torch.Generator().manual_seed(share.seed)
-    draw = 2.0 * torch.rand(qpos[:, q][:, 7:].shape, generator=generator) - 1.0
-    noise = share.start_noise * loose_joints(scene, torch.device("cpu")) * draw
-    athlete = qpos[:, q]
-    athlete[:, 7:] += noise.to(env.device)
+    qpos, qvel, seconds = qpos[::every], qvel[::every], seconds[::every]
     return Starts(
-        athlete,
+        shaken(qpos[:, q], scene, share.start_noise, share.seed),
         qvel[:, v],
         {ELAPSED: seconds},
         probability=1.0,

@@ -12,19 +12,20 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from rl.config import PRIOR, TrainConfig, config_from_dict, task_options
+from rl.config import PRIOR, TrainConfig, config_from_dict, task_options, with_tuples
 from rl.polish_config import Polish
+from warmstart.bank import data_folder
 
 OF_THE_RUN = frozenset(
     ("task", "out", "resume", "options", "physics_options", "device", "quiet", "profile")
     + ("checkpoint_minutes", "checkpoint_iterations", "keep_policies")
 )
 """Settings that change nothing in what is learned."""
-DEMONSTRATIONS = Path(__file__).resolve().parents[1] / "warmstart" / "data"
+ROOT = data_folder().parents[1]
 
 
 def train_words(card: Mapping[str, Any]) -> list[str]:
-    """``TASK --option value ...``, what ``olympics-opt train`` is told, but for ``--out``.
+    """``--option value ...``, what ``olympics-opt train TASK`` is told, but for ``--out``.
 
     Clips that the project holds have their path in it. Raises ValueError for a card without
     settings, or with some that there are no more.
@@ -33,39 +34,35 @@ def train_words(card: Mapping[str, Any]) -> list[str]:
         raise ValueError("its card holds no settings of a training")
     told_then = {"out": "", **card["config"]}
     if told_then.get("task") == PRIOR:  # whose learner is no PPO
-        told_then |= {"algo": "ppo", "ppo": {}}
+        told_then["ppo"] = {}
     config = config_from_dict(told_then)
     config = replace(config, clips=tuple(_placed(clip) for clip in config.clips))
     options = _options(config.task, config.options)
-    plain = TrainConfig(strength=config.strength, limits=config.limits)
-    told = ["--strength", config.strength]
-    told += [] if config.limits == TrainConfig.limits else ["--limits", config.limits]
-    usual = task_options(config.task)()
-    return [config.task, *told, *_words(config, plain), *_words(options, usual, "task.")]
+    plain = TrainConfig(strength=config.strength)  # which is always told
+    told = ["--strength", config.strength, *_words(config, plain)]
+    return [*told, *_words(options, type(options)(), "task.")]
 
 
 def polish_words(card: Mapping[str, Any]) -> list[str] | None:
-    """``TASK --option value ...``, what ``olympics-opt polish`` was told last, but for policies,
+    """``--option value ...``, what ``olympics-opt polish TASK`` was told last, but for policies,
     ``--out`` and how long it took; None for a policy that was not polished. Raises ValueError for
     settings that there are no more."""
     search = card.get("polish")
     if search is None:
         return None
     stages = search.get("stages") or [{"worlds": search.get("worlds", {})}]
-    worlds = dict(stages[-1]["worlds"])
-    worlds.pop("processes", None)
-    task = _options(card["task"], worlds.pop("task", {}))
+    worlds = stages[-1]["worlds"]
+    task = _options(card["task"], worlds.get("task", {}))
     # "episodes" are those of the whole search.
     names = {field.name for field in fields(Polish)} - {"others", "variation", "episodes"}
-    told = {name: _tuple(x) for name, x in (search | worlds).items() if name in names}
+    told = with_tuples({name: x for name, x in (search | worlds).items() if name in names})
     plain = Polish(name=card["task"], policy="", out=Path(), others=("",), minutes=1.0)
     try:
-        spans = {name: _tuple(x) for name, x in worlds.get("variation", {}).items()}
+        spans = with_tuples(worlds.get("variation", {}))
         config = replace(plain, **told, variation=replace(plain.variation, **spans))
     except TypeError as error:
         raise ValueError(f"the settings of its polish cannot be read ({error})") from error
-    usual = task_options(card["task"])()
-    return [card["task"], *_words(config, plain), *_words(task, usual, "task.")]
+    return [*_words(config, plain), *_words(task, type(task)(), "task.")]
 
 
 def missing(card: Mapping[str, Any]) -> list[str]:
@@ -75,8 +72,7 @@ def missing(card: Mapping[str, Any]) -> list[str]:
     init = config.get("init")
     if init is not None and not str(init).startswith("pretrained"):
         names.insert(0, str(init))
-    here = DEMONSTRATIONS.parents[1]
-    return [name for name in names if not ((here / name).exists() or Path(name).exists())]
+    return [name for name in names if not ((ROOT / name).exists() or Path(name).exists())]
 
 
 def _placed(clip: str | Path) -> Path:
@@ -84,38 +80,28 @@ def _placed(clip: str | Path) -> Path:
     a folder is told, the name as it is."""
     if Path(clip).name != str(clip):
         return Path(clip)
-    for found in sorted(DEMONSTRATIONS.rglob(Path(clip).name)):
-        return found.relative_to(DEMONSTRATIONS.parents[1])
+    for found in sorted(data_folder().rglob(Path(clip).name)):
+        return found.relative_to(ROOT)
     return Path(clip)
 
 
 def _options(task: str, told: Mapping[str, Any]) -> Any:
     """A task's options; those that a card is too old for have their defaults."""
-    given = {name: _tuple(x) for name, x in told.items()}
     try:
-        return task_options(task)(**given)
+        return task_options(task)(**with_tuples(told))
     except TypeError as error:
         raise ValueError(f"'{task}' has other options now ({error})") from error
 
 
-def _tuple(x: Any) -> Any:
-    """As it was before it became JSON."""
-    return tuple(x) if isinstance(x, list) else x
-
-
-def _words(value: Any, usual: Any, prefix: str = "") -> list[str]:
+def _words(value: Any, usual: Any, prefix: str = "") -> Iterator[str]:
     """Options of the fields that differ from the usual ones."""
-    return list(_each(value, usual, prefix))
-
-
-def _each(value: Any, usual: Any, prefix: str) -> Iterator[str]:
     for field in fields(value):
         told, common = getattr(value, field.name), getattr(usual, field.name)
         if told == common or (not prefix and field.name in OF_THE_RUN):
             continue
         name = field.name.replace("_", "-")
         if dataclasses.is_dataclass(told):
-            yield from _each(told, common, f"{prefix}{name}.")
+            yield from _words(told, common, f"{prefix}{name}.")
         elif isinstance(told, bool):
             yield f"--{prefix}{'' if told else 'no-'}{name}"
         else:

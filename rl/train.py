@@ -22,7 +22,7 @@ from rl import latent_run
 from rl.assembly import Assembly, MakeEnv, assemble, default_env, plays_own
 from rl.checkpoint import CheckpointError
 from rl.config import DEFAULT_SAMPLES, PRIOR, TrainConfig, load_starts, parse_args
-from rl.host import Signals, Stopwatch, join_ranks, leave_ranks, one_torch_thread
+from rl.host import Signals, Stopwatch, among_ranks, one_torch_thread
 from rl.meter import apart
 from rl.profiling import profile_training
 from rl.ranks import over_ranks
@@ -82,16 +82,10 @@ def train(
     Raises ValueError for settings that cannot be, PolicyError for ``init``, CheckpointError when
     a checkpoint cannot be written or read, RuntimeError for an engine that cannot run here.
     """
-    began_group = join_ranks(config.device, share=config.own_ranks > 0)
-    try:
+    with among_ranks(config.device, share=config.own_ranks > 0):
         made = assemble(settle(config), starts, environment)
         trainer = _Trainer(made, on_iteration)
-        summary = trainer.profile() if config.profile else trainer.run(part)
-    except ValueError:  # every rank has made the same mistake
-        leave_ranks(began_group)
-        raise
-    leave_ranks(began_group)
-    return summary
+        return trainer.profile() if config.profile else trainer.run(part)
 
 
 class _Trainer:

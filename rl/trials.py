@@ -20,6 +20,7 @@ from rl.policy import Policy
 from rl.recording import Recording, Tape
 from sports.env import Env, Starts, StepResult, make_env
 from sports.registry import get_task
+from sports.scene import Scene
 from sports.starts import START_NOISE, loose_joints
 
 START_FRAMES = 4096
@@ -104,13 +105,18 @@ def opened(policy: Policy, share: Share) -> Iterator[Env]:
 def standing_starts(env: Env, noise: float, seed: int) -> Starts:
     """Frames of the standing start with joint noise +-``noise`` (rad), of agent 0."""
     scene = env.physics.scene
-    generator = torch.Generator().manual_seed(seed)
     start = torch.tensor(scene.default_qpos()[scene.agent_qpos(0)], dtype=torch.float32)
-    qpos = start.repeat(START_FRAMES, 1)
-    draw = 2.0 * torch.rand(qpos[:, 7:].shape, generator=generator) - 1.0
-    qpos[:, 7:] += noise * loose_joints(scene, qpos.device) * draw
+    qpos = shaken(start.repeat(START_FRAMES, 1), scene, noise, seed)
     qvel = torch.zeros(START_FRAMES, 6 + scene.body.num_dofs)
     return Starts(qpos, qvel, {}, probability=1.0).to(env.device)
+
+
+def shaken(qpos: Tensor, scene: Scene, noise: float, seed: int) -> Tensor:
+    """(F, 7 + num_dofs) of one athlete, with joint noise +-``noise`` (rad) drawn on the CPU."""
+    generator = torch.Generator().manual_seed(seed)
+    draw = 2.0 * torch.rand(qpos[:, 7:].shape, generator=generator) - 1.0
+    moved = noise * loose_joints(scene, draw.device) * draw
+    return torch.cat((qpos[:, :7], qpos[:, 7:] + moved.to(qpos.device)), dim=1)
 
 
 def ranked(task: str, values: Mapping[str, np.ndarray], of: Iterable[int]) -> list[int]:

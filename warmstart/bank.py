@@ -158,25 +158,27 @@ def label(clip: Clip, name: str) -> float:
     return float("nan")
 
 
+def data_folder(*parts: str) -> Path:
+    """Where the shipped demonstrations lie, or a folder in there."""
+    return Path(str(resources.files("warmstart").joinpath(DATA, *parts)))
+
+
 def demonstration_files(problem: str | None = None) -> list[Path]:
     """The shipped npz files, of one problem or of all, by name."""
-    folder = Path(str(resources.files("warmstart").joinpath(DATA)))
-    files = sorted(folder.glob("*.npz"))
+    files = sorted(data_folder().glob("*.npz"))
     return [f for f in files if problem is None or f.name.startswith(f"{problem}_")]
 
 
 def thrown_files(task: str) -> list[Path]:
     """The shipped throws of a task that were searched in MuJoCo and have no plan, one for each
     strength: ``warmstart/data/throws/TASK_STRENGTH.npz``."""
-    folder = Path(str(resources.files("warmstart").joinpath(DATA, "throws")))
-    return sorted(folder.glob(f"{task}_*.npz"))
+    return sorted(data_folder("throws").glob(f"{task}_*.npz"))
 
 
 def approach_files(task: str) -> list[Path]:
     """The shipped episodes of a task that lead from its own start to a certified demonstration and
     through it, as MuJoCo played them: ``warmstart/data/approaches/NAME.npz``."""
-    folder = Path(str(resources.files("warmstart").joinpath(DATA, "approaches")))
-    return sorted(folder.glob(f"{task}_*.npz"))
+    return sorted(data_folder("approaches").glob(f"{task}_*.npz"))
 
 
 def load_demonstrations(problem: str, strength: str | None = None) -> list[Clip]:

@@ -22,9 +22,10 @@ from rl.directions import (
     towards,
     weights_of,
 )
+from rl.host import RANK_STEP
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError, load_policy
-from rl.polish import RANK_STEP, Aim, Crowd, Search, aims, met, polish, worth
+from rl.polish import Aim, Crowd, Search, aims, met, polish, worth
 from rl.polish_config import Polish
 from rl.runlog import read_progress
 from rl.trials import Share, play_episodes
