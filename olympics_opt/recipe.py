@@ -28,7 +28,8 @@ def run_recipe(config: Recipe) -> int:
             "export --mean."
         )
     if polished is not None:
-        start = ["olympics-opt", "polish", config.name, "--policy", run, "--out", f"{run}_polished"]
+        start = [*_polisher(card["polish"]), config.name]
+        start += ["--policy", run, "--out", f"{run}_polished"]
         episodes = f"{card['polish'].get('episodes', 0):,} episodes"
         print(f"\nThen, {episodes} in all (say how many with --minutes or --generations):\n")
         print(_wrapped([*start, *polished]))
@@ -73,9 +74,21 @@ def _starter(card: dict[str, Any]) -> list[str]:
     found = re.match(r"(\d+) x ", str(card.get("hardware", "")))
     own = card["config"].get("own_ranks", 0)
     processes = max(int(found[1]) if found else 1, own + 1)
+    return ["olympics-opt", "train"] if processes == 1 else [*_among(processes), "rl.train"]
+
+
+def _polisher(search: dict[str, Any]) -> list[str]:
+    """As many processes as played the last stage."""
+    stages = search.get("stages") or [{"worlds": {}}]
+    processes = stages[-1]["worlds"].get("processes", 1)
     if processes == 1:
-        return ["olympics-opt", "train"]
-    return ["torchrun", "--standalone", "--nproc-per-node", str(processes), "-m", "rl.train"]
+        return ["olympics-opt", "polish"]
+    return [*_among(processes), "olympics_opt", "polish"]
+
+
+def _among(processes: int) -> list[str]:
+    """Runs the module that follows in each of them."""
+    return ["torchrun", "--standalone", "--nproc-per-node", str(processes), "-m"]
 
 
 def _wrapped(words: list[str]) -> str:

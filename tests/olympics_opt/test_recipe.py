@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 
@@ -64,6 +65,18 @@ def test_two_kinds_of_worlds_want_two_processes(capsys):
     text, commands = told(capsys, "hurdling", "--policy", "pretrained:latent-varied")
     assert commands[0][:4] == ["torchrun", "--standalone", "--nproc-per-node", "2"]
     assert "mean of 3 states" in text and "253,952 episodes" in text
+
+
+def test_a_polish_of_several_processes_is_told_as_one(tmp_path, capsys):
+    """With a card as ``polish`` writes it under ``torchrun``."""
+    shipped = pretrained.locate("hurdling", "latent-varied")
+    policy = Path(shutil.copy(shipped, tmp_path))
+    card = pretrained.card(shipped)
+    card["polish"]["stages"] = [{"episodes": 96, "worlds": {"engine": "mujoco", "processes": 3}}]
+    policy.with_suffix(".json").write_text(json.dumps(card))
+    _, (_, polish) = told(capsys, "hurdling", "--policy", str(policy))
+    assert polish[:6] == "torchrun --standalone --nproc-per-node 3 -m olympics_opt".split()
+    assert polish[6:8] == ["polish", "hurdling"]
 
 
 def test_the_prior_has_a_recipe_too(capsys):
