@@ -32,12 +32,13 @@ def _one_torch_thread() -> None:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _temporary_files_go_with_pytests_own(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[None]:
-    """Of other libraries and of the programs that tests start; pytest keeps three sessions' own."""
-    folder = str(tmp_path_factory.mktemp("tmp"))
-    with pytest.MonkeyPatch.context() as patch:
+def _temporary_files_go_at_the_end() -> Iterator[None]:
+    """Of other libraries and of the programs that tests start. Not in pytest's own folder: the
+    names of sockets in it would be too long."""
+    with (
+        tempfile.TemporaryDirectory(prefix="t", ignore_cleanup_errors=True) as folder,
+        pytest.MonkeyPatch.context() as patch,
+    ):
         patch.setenv("TMPDIR", folder)
         patch.setattr(tempfile, "tempdir", folder)
         yield
