@@ -25,7 +25,9 @@ def test_panel_of_a_demonstration_is_printed_and_written(tmp_path: Path, capsys)
 def test_policies_are_played_each_in_its_task(tmp_path: Path, capsys) -> None:
     words = ["likeness", "pretrained", "--task", "long_jump", "--trials", "2"]
     assert main([*words, "--out", str(tmp_path)]) == 0
-    found = {p.stem.removeprefix("likeness_"): json.loads(p.read_text()) for p in tmp_path.iterdir()}
+    found = {
+        p.stem.removeprefix("likeness_"): json.loads(p.read_text()) for p in tmp_path.iterdir()
+    }
     shipped = [p for p in available() if p["task"] == "long_jump"]
     assert sorted(found) == sorted(f"long_jump_{p['name']}_{p['strength']}" for p in shipped)
     human, paper = (found[f"long_jump_ppo_{strength}"] for strength in ("human", "paper"))
