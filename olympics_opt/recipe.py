@@ -74,13 +74,16 @@ def _starter(card: dict[str, Any]) -> list[str]:
     found = re.match(r"(\d+) x ", str(card.get("hardware", "")))
     own = card["config"].get("own_ranks", 0)
     processes = max(int(found[1]) if found else 1, own + 1)
-    return ["olympics-opt", "train"] if processes == 1 else [*_among(processes), "rl.train"]
+    if processes == 1:
+        return ["olympics-opt", "train"]
+    return [*_among(processes), "rl.train"]
 
 
 def _polisher(search: dict[str, Any]) -> list[str]:
     """As many processes as played the last stage."""
-    stages = search.get("stages") or [{"worlds": {}}]
-    processes = stages[-1]["worlds"].get("processes", 1)
+    from rl.recipe import last_worlds
+
+    processes = last_worlds(search).get("processes", 1)
     if processes == 1:
         return ["olympics-opt", "polish"]
     return [*_among(processes), "olympics_opt", "polish"]

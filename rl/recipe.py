@@ -50,8 +50,7 @@ def polish_words(card: Mapping[str, Any]) -> list[str] | None:
     search = card.get("polish")
     if search is None:
         return None
-    stages = search.get("stages") or [{"worlds": search.get("worlds", {})}]
-    worlds = stages[-1]["worlds"]
+    worlds = last_worlds(search)
     task = _options(card["task"], worlds.get("task", {}))
     # "episodes" are those of the whole search.
     names = {field.name for field in fields(Polish)} - {"others", "variation", "episodes"}
@@ -63,6 +62,12 @@ def polish_words(card: Mapping[str, Any]) -> list[str] | None:
     except TypeError as error:
         raise ValueError(f"the settings of its polish cannot be read ({error})") from error
     return [*_words(config, plain), *_words(task, type(task)(), "task.")]
+
+
+def last_worlds(search: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What the last episodes of a polish were played in; ``search`` is the card's word of it."""
+    stages = search.get("stages") or [{"worlds": search.get("worlds", {})}]
+    return stages[-1]["worlds"]
 
 
 def missing(card: Mapping[str, Any]) -> list[str]:

@@ -32,9 +32,12 @@ def _one_torch_thread() -> None:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _temporary_files_go_at_the_end() -> Iterator[None]:
+def _temporary_files_go_at_the_end(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[None]:
     """Of other libraries and of the programs that tests start. Not in pytest's own folder: the
     names of sockets in it would be too long."""
+    tmp_path_factory.getbasetemp()  # which stays where it is, for who looks into it afterwards
     with (
         tempfile.TemporaryDirectory(prefix="t", ignore_cleanup_errors=True) as folder,
         pytest.MonkeyPatch.context() as patch,
