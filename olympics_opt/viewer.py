@@ -90,7 +90,7 @@ class Session:
         )
         self.policy.check(self.env)
         self.policy.seed(seed)
-        self.env.starts = standing_starts(self.env, START_NOISE, seed)
+        self.env.starts = standing_starts(self.env, START_NOISE)
         self.env.keep_snapshot = True
         self.paused = False
         self._speed = SPEEDS.index(1.0)

@@ -49,7 +49,7 @@ from rl.policy_stack import PolicyStack
 from rl.polish_config import Polish
 from rl.ranks import gathered, own_rank
 from rl.runlog import KINDS, Row, RunLog
-from rl.trials import Share, opened, play_episodes, shaken
+from rl.trials import Share, opened, play_episodes
 from rl.worlds import engine_options, in_own_worlds
 from sports.env import Env, Starts
 from sports.humanoid.body import load_body
@@ -245,7 +245,7 @@ def _polish(config: Polish, options: dict[str, Any] | None, quiet: bool) -> list
         directions, crowd = Directions(weights_of(policy), changes), Crowd(policy, config.blocks)
         spent.enter(_worlds(config, options, ranks))
         if config.begin is not None:
-            starts = met(policy, share, env, config.begin)
+            starts = met(policy, share, env, config.begin, wanted, config.worst)
             for _, each in grounds:
                 each.starts = starts
 
@@ -381,43 +381,71 @@ def watched(policy: Policy, share: Share, env: Env) -> tuple[Tensor, Tensor]:
 
     play_episodes(probe, share, env)
     rows, gone = (torch.cat(x) for x in zip(*seen, strict=True))
-    every = max(1, len(rows) // WATCHED_ROWS)
-    return rows[::every], gone[::every]
+    return _thinned(rows, WATCHED_ROWS), _thinned(gone, WATCHED_ROWS)
 
 
-def met(policy: Policy, share: Share, env: Env, part: tuple[float, float]) -> Starts:
+def _thinned(rows: Tensor, most: int) -> Tensor:
+    """Every k-th of them: fewer than twice ``most``."""
+    return rows[:: max(1, len(rows) // most)]
+
+
+def met(
+    policy: Policy,
+    share: Share,
+    env: Env,
+    part: tuple[float, float],
+    wanted: Sequence[Aim] = (),
+    worst: float | None = None,
+) -> Starts:
     """States that the policy comes to in this part of its episodes (shares of the longest), as
-    starts with the share's noise of the joints. Raises ValueError where no episode lasts so long,
-    and for more than one athlete.
+    starts with the share's noise of the joints; with ``worst`` half of them from this share of the
+    episodes alone, those worth least. Raises ValueError where no episode lasts so long, and for
+    more than one athlete.
     """
     if env.num_agents > 1:
         raise ValueError("who has an opponent begins with it: leave --begin out")
     scene = env.physics.scene
     q, v, free = scene.agent_qpos(0), scene.agent_qvel(0), len(scene.free_objects)
     low, high = (round(x * env.max_steps) for x in part)
-    seen: list[tuple[Tensor, Tensor, Tensor]] = []
+    seen: list[tuple[Tensor, ...]] = []
+    trial = torch.arange(env.num_worlds, device=env.device)
+    before = torch.zeros_like(trial)
 
     def probe(obs: Tensor) -> Tensor:
         clock = env.view.clock
-        here = (clock >= low) & (clock <= high)
+        trial.add_(env.num_worlds * (clock < before))
+        before.copy_(clock)
+        here = (clock >= low) & (clock <= high) & (trial < share.trials)
         seconds = clock[here] * env.view.control_timestep
-        seen.append((env.physics.qpos[here], env.physics.qvel[here], seconds))
+        seen.append((env.physics.qpos[here], env.physics.qvel[here], seconds, trial[here]))
         return policy(obs)
 
-    play_episodes(probe, share, env)
-    qpos, qvel, seconds = (torch.cat(x) for x in zip(*seen, strict=True))
-    if not len(qpos):
+    trials = play_episodes(probe, share, env).trials
+    qpos, qvel, seconds, of = (torch.cat(x) for x in zip(*seen, strict=True))
+    rows = torch.arange(len(of), device=of.device)
+    if not len(rows):
         raise ValueError(f"no episode lasts until {part[0]:.0%} of the longest: begin earlier")
-    every = max(1, len(qpos) // WATCHED_ROWS)
-    qpos, qvel, seconds = qpos[::every], qvel[::every], seconds[::every]
+    if worst is not None:
+        order = np.argsort(worth(trials, wanted), kind="stable")
+        lost = torch.from_numpy(order[: math.ceil(worst * len(order))]).to(of.device)
+        some = rows[torch.isin(of, lost)]
+        if not len(some):
+            raise ValueError(f"the worst episodes end before {part[0]:.0%}: begin earlier")
+        every = _thinned(rows, WATCHED_ROWS // 2)
+        some = _thinned(some, WATCHED_ROWS // 2)
+        again = torch.arange(len(every), device=of.device) % len(some)
+        rows = torch.cat((every, some[again]))
+    rows = _thinned(rows, WATCHED_ROWS)
+    qpos, qvel, seconds = qpos[rows], qvel[rows], seconds[rows]
     return Starts(
-        shaken(qpos[:, q], scene, share.start_noise, share.seed),
+        qpos[:, q],
         qvel[:, v],
         {ELAPSED: seconds},
         probability=1.0,
         object_qpos=qpos[:, -7 * free :] if free else None,
         object_qvel=qvel[:, -6 * free :] if free else None,
         blocks=share.blocks,
+        noise=share.start_noise,
     )
 
 
@@ -476,7 +504,8 @@ def _worlds(config: Polish, options: dict[str, Any] | None, ranks: int) -> dict[
     told = {name: getattr(config, name) for name in ("engine", *names)} | {"task": options or {}}
     given, usual = vars(config.variation), vars(Variation())
     told["variation"] = {name: x for name, x in given.items() if x != usual[name]}
-    told |= {"processes": ranks if ranks > 1 else None, "begin": config.begin}
+    told |= {"processes": ranks if ranks > 1 else None}
+    told |= {"begin": config.begin, "worst": config.worst}
     return json.loads(json.dumps({name: x for name, x in told.items() if x}))
 
 

@@ -48,6 +48,9 @@ class Polish:
     longest one), with the noise of ``start_noise``: a race that is lost at its last hurdle is
     judged by its end alone, in a fifth of the time. The rules begin anew there: what was achieved
     before does not count."""
+    worst: float | None = None
+    """Half of the starts of ``begin`` come from this share of the episodes alone, those that are
+    worth least: what one race in 300 is lost by, half of the races then begin with."""
     joints: tuple[str, ...] = ()
     """Shift these alone, by name (``R_Shoulder_*``, ``Torso_?``); by default every action. What a
     throw needs is in the trunk and one arm, not in 153 joints."""
@@ -103,6 +106,11 @@ class Polish:
                 raise ValueError("a part of the episodes needs --components of 1 or more")
         if self.begin is not None and not 0.0 <= self.begin[0] <= self.begin[1] <= 1.0:
             raise ValueError(f"episodes begin between two shares of the longest, not {self.begin}")
+        if self.worst is not None:
+            if not 0.0 < self.worst <= 1.0:
+                raise ValueError(f"the worst are a share of the episodes, not {self.worst}")
+            if self.begin is None:
+                raise ValueError("the worst episodes give starts to --begin: say where it begins")
         if not 0.0 <= self.start_noise < 1.0:
             raise ValueError(f"the starts' noise must lie in [0, 1) rad, not {self.start_noise}")
         if self.shift <= 0.0 or self.share <= 0.0:

@@ -20,10 +20,8 @@ from rl.policy import Policy
 from rl.recording import Recording, Tape
 from sports.env import Env, Starts, StepResult, make_env
 from sports.registry import get_task
-from sports.scene import Scene
-from sports.starts import START_NOISE, loose_joints
+from sports.starts import START_NOISE
 
-START_FRAMES = 4096
 KEEP_ALL = 64
 """A share of more trials keeps its best and its median only."""
 
@@ -94,7 +92,7 @@ def opened(policy: Policy, share: Share) -> Iterator[Env]:
         policy.to(env.device)
         policy.seed(share.seed)
         if share.start_noise > 0.0:
-            env.starts = standing_starts(env, share.start_noise, share.seed)
+            env.starts = standing_starts(env, share.start_noise)
             env.starts.blocks = share.blocks
         with one_torch_thread(env.device):
             yield env
@@ -102,21 +100,12 @@ def opened(policy: Policy, share: Share) -> Iterator[Env]:
         env.close()
 
 
-def standing_starts(env: Env, noise: float, seed: int) -> Starts:
-    """Frames of the standing start with joint noise +-``noise`` (rad), of agent 0."""
+def standing_starts(env: Env, noise: float) -> Starts:
+    """Agent 0 standing, with joint noise +-``noise`` (rad) that is another in every episode."""
     scene = env.physics.scene
-    start = torch.tensor(scene.default_qpos()[scene.agent_qpos(0)], dtype=torch.float32)
-    qpos = shaken(start.repeat(START_FRAMES, 1), scene, noise, seed)
-    qvel = torch.zeros(START_FRAMES, 6 + scene.body.num_dofs)
-    return Starts(qpos, qvel, {}, probability=1.0).to(env.device)
-
-
-def shaken(qpos: Tensor, scene: Scene, noise: float, seed: int) -> Tensor:
-    """(F, 7 + num_dofs) of one athlete, with joint noise +-``noise`` (rad) drawn on the CPU."""
-    generator = torch.Generator().manual_seed(seed)
-    draw = 2.0 * torch.rand(qpos[:, 7:].shape, generator=generator) - 1.0
-    moved = noise * loose_joints(scene, draw.device) * draw
-    return torch.cat((qpos[:, :7], qpos[:, 7:] + moved.to(qpos.device)), dim=1)
+    qpos = torch.tensor(scene.default_qpos()[None, scene.agent_qpos(0)], dtype=torch.float32)
+    qvel = torch.zeros(1, 6 + scene.body.num_dofs)
+    return Starts(qpos, qvel, {}, probability=1.0, noise=noise).to(env.device)
 
 
 def ranked(task: str, values: Mapping[str, np.ndarray], of: Iterable[int]) -> list[int]:

@@ -38,7 +38,9 @@ class Starts:
     object_qvel: Tensor | None = None
     """(F, 6 k)"""
     blocks: int = 1
-    """The worlds come in so many blocks that draw the same frames."""
+    """The worlds come in so many blocks that draw the same frames, with the same noise."""
+    noise: float = 0.0
+    """+- joint noise (rad), uniform, drawn anew with every frame."""
 
     def to(self, device: torch.device | str) -> Starts:
         """The same frames on a device."""
@@ -50,6 +52,7 @@ class Starts:
             self.probability,
             *things,
             blocks=self.blocks,
+            noise=self.noise,
         )
 
     def draw(self, state: PhysicsState, scene: Scene, generator: torch.Generator) -> Memory:
@@ -65,6 +68,11 @@ class Starts:
         q, v = scene.agent_qpos(0), scene.agent_qvel(0)
         state.qpos[:, q] = torch.where(use[:, None], self.qpos[frame], state.qpos[:, q])
         state.qvel[:, v] = torch.where(use[:, None], self.qvel[frame], state.qvel[:, v])
+        if self.noise > 0.0:
+            joints = state.qpos[:, q][:, 7:]
+            size = (each, joints.shape[1])
+            draw = torch.rand(size, device=device, generator=generator).repeat(self.blocks, 1)
+            joints += use[:, None] * self.noise * loose_joints(scene, device) * (2.0 * draw - 1.0)
         if self.object_qpos is not None and self.object_qvel is not None:
             free = len(scene.free_objects)
             if self.object_qpos.shape[1] != 7 * free:

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from rl.evaluate import EvaluationResult, evaluate, interval
+from rl.policy import load_policy
 from rl.recording import Recording
-from rl.trials import ranked
+from rl.trials import Share, opened, ranked
 from sports.env import make_env
 from sports.registry import get_task
 
@@ -121,6 +122,30 @@ def test_trials_differ_but_a_seed_repeats_them(played):
     assert again.recordings == {}
     zero = evaluate("zero", "high_jump", trials=6, num_worlds=6, seed=4)
     assert len(np.unique(zero.trials["return"])) == 6  # by the start noise alone
+
+
+def test_no_two_trials_begin_alike():
+    """A thousand starts drawn out of 4096, as they once were, are 887 different ones."""
+    noise, worlds = 0.02, 1000
+    share = Share("free_throw", "mujoco", worlds, worlds, 0, "human", "paper", {})
+    with opened(load_policy("zero", "free_throw"), share) as env:
+        scene = env.physics.scene
+        assert env.starts is not None
+        env.starts.blocks = 2
+        begun = []
+        for _ in range(2):
+            env.reset()
+            begun.append(env.physics.qpos[:, scene.agent_qpos(0)].clone())
+        rest = torch.tensor(scene.default_qpos()[scene.agent_qpos(0)], dtype=torch.float32)
+    for rows in begun:
+        assert torch.equal(rows[:500], rows[500:])
+    joints = torch.cat([rows[:500, 7:] for rows in begun]) - rest[7:]
+    assert torch.equal(begun[0][:, :7], rest[:7].expand(worlds, 7))
+    assert len(joints.unique(dim=0)) == 1000
+    loose = torch.tensor([dof.name not in scene.steady for dof in scene.body.dofs])
+    assert 0 < loose.sum() < len(loose) and (joints[:, ~loose] == 0.0).all()
+    drawn = joints[:, loose].double().flatten().numpy() / (2 * noise) + 0.5
+    assert stats.kstest(drawn, "uniform").pvalue > 1e-4
 
 
 def test_recordings_are_the_episodes_they_name(played):

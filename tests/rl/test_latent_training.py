@@ -369,7 +369,7 @@ def test_an_evaluation_is_stepping_by_hand(folder, tmp_path, monkeypatch):
 
     policy, prior = load_policy(path, "penalty_kick"), load_prior(folder / "prior")
     env = make_env("penalty_kick", num_worlds=3, seed=5, training=False)
-    env.starts = standing_starts(env, START_NOISE, 5)
+    env.starts = standing_starts(env, START_NOISE)
     obs, total = env.reset(), torch.zeros(3)
     open_ = torch.ones(3, dtype=torch.bool)
     assert policy.actor is not None

@@ -28,7 +28,7 @@ from rl.policy import Policy, PolicyError, load_policy
 from rl.polish import Aim, Crowd, Search, aims, met, polish, worth
 from rl.polish_config import Polish
 from rl.runlog import read_progress
-from rl.trials import Share, play_episodes
+from rl.trials import Share, opened, play_episodes, standing_starts
 from sports.env import Env, make_env
 from sports.humanoid.body import load_body
 from sports.physics.variation import Variation
@@ -168,17 +168,48 @@ def test_episodes_begin_where_the_policy_is_in_a_part_of_them(
     common = {"engine": "mujoco", "trials": 2, "worlds": 2, "seed": 0, "options": {}}
     share = Share(CONFIG.name, strength="paper", limits="paper", start_noise=0.05, **common)
     env = make_env(CONFIG.name, num_worlds=2, training=False)
-    noisy = met(policy, share, env, (at, at))
-    env.close()
-    moved = (noisy.qpos - qpos)[:, 7:].abs()
+    env.starts = met(policy, share, env, (at, at))
+    env.reset()
+    moved = (env.physics.qpos - qpos)[:, 7:].abs()
     assert 0.03 < float(moved.max()) < 0.051
-    assert (noisy.qvel - qvel).abs().max() < 1e-3
+    assert (env.physics.qvel - qvel).abs().max() < 1e-3
+    env.close()
     with pytest.raises(ValueError, match="begin earlier"):
         polish(replace(config, begin=(0.99, 1.0), out=tmp_path / "never"), quiet=True)
     duel = {"name": "boxing", "policy": "pretrained:selfplay", "objective": "success=1"}
     with pytest.raises(ValueError, match="opponent"):
         polish(replace(config, out=tmp_path / "never", **duel), quiet=True)
     assert not (tmp_path / "never").exists()
+
+
+def test_half_of_the_starts_come_from_the_worst_episodes():
+    """Two rounds in three worlds, of which the last trial is one too many."""
+    step, policy = 33, load_policy(CONFIG.policy, CONFIG.name)
+    share = Share(CONFIG.name, "mujoco", 5, 3, 0, "paper", "paper", {}, start_noise=0.0)
+    states: list[list[torch.Tensor]] = [[], [], []]
+
+    def look(obs: torch.Tensor) -> torch.Tensor:
+        for world in torch.nonzero(env.view.clock == step).flatten().tolist():
+            states[world].append(env.physics.qpos[world].clone())
+        return policy(obs)
+
+    with opened(policy, share) as env:
+        env.starts = standing_starts(env, 0.08)
+        length = np.nan_to_num(play_episodes(look, share, env).trials["length"])
+    every = torch.stack([states[trial % 3][trial // 3] for trial in range(5)])
+    last = every[length.argsort()[:2]]  # 0.3 of five are two
+    with opened(policy, share) as env:
+        env.starts = standing_starts(env, 0.08)
+        at = step / env.max_steps
+        starts = met(policy, share, env, (at, at), aims("length=1", CONFIG.name), worst=0.3)
+        with pytest.raises(ValueError, match="begin earlier"):
+            met(policy, share, env, (0.9, 1.0), aims("length=1", CONFIG.name), worst=0.3)
+    assert len(starts.qpos) == 10
+    some, rest = starts.qpos[5:], starts.qpos[:5]
+    for rows, of, times in ((rest, every, 1), (some, last, 2)):
+        near = torch.cdist(rows.double(), of.double()) < 1e-4
+        assert near.any(1).all() and (near.sum(0) >= times).all()
+        assert near.sum() == len(rows)
 
 
 def test_everyone_in_a_crowd_plays_in_its_own_block():
@@ -290,6 +321,8 @@ def test_mistakes_are_told_before_anything_is_played(tmp_path: Path):
         ({"part": (0.8, 0.2)}, "two shares"),
         ({"part": (0.8, 0.9), "components": 0}, "--components of 1"),
         ({"begin": (0.8, 1.2)}, "begin between two shares"),
+        ({"begin": (0.1, 0.2), "worst": 0.0}, "share of the episodes, not 0.0"),
+        ({"worst": 0.1}, "say where it begins"),
         ({"variation": Variation(uneven=0.1)}, "--vary as well"),
         ({"vary": True, "engine": "drake"}, "drake has worlds of its own"),
         ({"joints": ("R_*",), "components": -1, "others": ("zero",)}, "--joints"),
