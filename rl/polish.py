@@ -408,6 +408,8 @@ def met(
     q, v, free = scene.agent_qpos(0), scene.agent_qvel(0), len(scene.free_objects)
     low, high = (round(x * env.max_steps) for x in part)
     seen: list[tuple[Tensor, ...]] = []
+    if env.starts is not None:
+        env.starts.blocks = 1  # nobody searches yet: every world has a start of its own
     trial = torch.arange(env.num_worlds, device=env.device)
     before = torch.zeros_like(trial)
 

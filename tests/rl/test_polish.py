@@ -183,9 +183,10 @@ def test_episodes_begin_where_the_policy_is_in_a_part_of_them(
 
 
 def test_half_of_the_starts_come_from_the_worst_episodes():
-    """Two rounds in three worlds, of which the last trial is one too many."""
+    """Two rounds in three worlds, of which the last trial is one too many; three policies will play
+    there, but whose states they are is one."""
     step, policy = 33, load_policy(CONFIG.policy, CONFIG.name)
-    share = Share(CONFIG.name, "mujoco", 5, 3, 0, "paper", "paper", {}, start_noise=0.0)
+    share = Share(CONFIG.name, "mujoco", 5, 3, 0, "paper", "paper", {}, start_noise=0.0, blocks=3)
     states: list[list[torch.Tensor]] = [[], [], []]
 
     def look(obs: torch.Tensor) -> torch.Tensor:
@@ -199,12 +200,12 @@ def test_half_of_the_starts_come_from_the_worst_episodes():
     every = torch.stack([states[trial % 3][trial // 3] for trial in range(5)])
     last = every[length.argsort()[:2]]  # 0.3 of five are two
     with opened(policy, share) as env:
-        env.starts = standing_starts(env, 0.08)
+        env.starts = replace(standing_starts(env, 0.08), blocks=3)
         at = step / env.max_steps
         starts = met(policy, share, env, (at, at), aims("length=1", CONFIG.name), worst=0.3)
         with pytest.raises(ValueError, match="begin earlier"):
             met(policy, share, env, (0.9, 1.0), aims("length=1", CONFIG.name), worst=0.3)
-    assert len(starts.qpos) == 10
+    assert (len(starts.qpos), starts.blocks) == (10, 3)
     some, rest = starts.qpos[5:], starts.qpos[:5]
     for rows, of, times in ((rest, every, 1), (some, last, 2)):
         near = torch.cdist(rows.double(), of.double()) < 1e-4
