@@ -398,9 +398,9 @@ def met(
     worst: float | None = None,
 ) -> Starts:
     """States that the policy comes to in this part of its episodes (shares of the longest), as
-    starts with the share's noise of the joints; with ``worst`` half of them from this share of the
-    episodes alone, those worth least. Raises ValueError where no episode lasts so long, and for
-    more than one athlete.
+    starts with the share's noise of the joints; with ``worst`` from this share of the episodes
+    alone, those worth least, and for each of them a whole episode. Raises ValueError where no
+    episode lasts so long, and for more than one athlete.
     """
     if env.num_agents > 1:
         raise ValueError("who has an opponent begins with it: leave --begin out")
@@ -424,21 +424,24 @@ def met(
 
     trials = play_episodes(probe, share, env).trials
     qpos, qvel, seconds, of = (torch.cat(x) for x in zip(*seen, strict=True))
-    rows = torch.arange(len(of), device=of.device)
-    if not len(rows):
+    if not len(of):
         raise ValueError(f"no episode lasts until {part[0]:.0%} of the longest: begin earlier")
     if worst is not None:
         order = np.argsort(worth(trials, wanted), kind="stable")
         lost = torch.from_numpy(order[: math.ceil(worst * len(order))]).to(of.device)
-        some = rows[torch.isin(of, lost)]
-        if not len(some):
+        some = torch.isin(of, lost)
+        if not some.any():
             raise ValueError(f"the worst episodes end before {part[0]:.0%}: begin earlier")
-        every = _thinned(rows, WATCHED_ROWS // 2)
-        some = _thinned(some, WATCHED_ROWS // 2)
-        again = torch.arange(len(every), device=of.device) % len(some)
-        rows = torch.cat((every, some[again]))
-    rows = _thinned(rows, WATCHED_ROWS)
-    qpos, qvel, seconds = qpos[rows], qvel[rows], seconds[rows]
+        qpos, qvel, seconds = qpos[some], qvel[some], seconds[some]
+    qpos, qvel, seconds = (_thinned(x, WATCHED_ROWS) for x in (qpos, qvel, seconds))
+    if worst is not None:  # as many whole episodes: NaN is what a start of the rules has
+        default = torch.tensor(scene.default_qpos(), dtype=qpos.dtype, device=qpos.device)
+        default[len(default) - 7 * free :] = torch.nan
+        nothing = torch.full_like(qvel, torch.nan)
+        nothing[:, v] = 0.0
+        qpos = torch.cat((qpos, default.expand_as(qpos)))
+        qvel = torch.cat((qvel, nothing))
+        seconds = torch.cat((seconds, torch.full_like(seconds, torch.nan)))
     return Starts(
         qpos[:, q],
         qvel[:, v],

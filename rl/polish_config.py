@@ -49,8 +49,9 @@ class Polish:
     judged by its end alone, in a fifth of the time. The rules begin anew there: what was achieved
     before does not count."""
     worst: float | None = None
-    """Half of the starts of ``begin`` come from this share of the episodes alone, those that are
-    worth least: what one race in 300 is lost by, half of the races then begin with."""
+    """``begin`` takes its states from this share of the episodes alone, those worth least, for half
+    of the starts; the others are whole episodes, without which a search gets good at states that
+    it does not come to any more. Where one race in 300 is lost, one in ten of these is."""
     joints: tuple[str, ...] = ()
     """Shift these alone, by name (``R_Shoulder_*``, ``Torso_?``); by default every action. What a
     throw needs is in the trunk and one arm, not in 153 joints."""

@@ -205,12 +205,28 @@ def test_half_of_the_starts_come_from_the_worst_episodes():
         starts = met(policy, share, env, (at, at), aims("length=1", CONFIG.name), worst=0.3)
         with pytest.raises(ValueError, match="begin earlier"):
             met(policy, share, env, (0.9, 1.0), aims("length=1", CONFIG.name), worst=0.3)
-    assert (len(starts.qpos), starts.blocks) == (10, 3)
-    some, rest = starts.qpos[5:], starts.qpos[:5]
-    for rows, of, times in ((rest, every, 1), (some, last, 2)):
-        near = torch.cdist(rows.double(), of.double()) < 1e-4
-        assert near.any(1).all() and (near.sum(0) >= times).all()
-        assert near.sum() == len(rows)
+    assert (len(starts.qpos), starts.blocks) == (4, 3)
+    near = torch.cdist(starts.qpos[:2].double(), last.double()) < 1e-4
+    assert near.any(0).all() and near.sum() == 2
+    elapsed = starts.context["elapsed"]
+    torch.testing.assert_close(elapsed[:2], torch.full((2,), step * env.view.control_timestep))
+    assert elapsed[2:].isnan().all()
+    # The other half begin as every episode does, moved by the same noise.
+    with opened(policy, share) as env:
+        env.reset()
+        rules = env.physics.qpos.clone(), env.physics.qvel.clone()
+        env.starts = replace(starts, blocks=1, noise=0.0)
+        drawn = [whole_starts(env, rules) for _ in range(20)]
+    assert 0.2 < np.mean(drawn) < 0.8
+
+
+def whole_starts(env: Env, rules: tuple[torch.Tensor, torch.Tensor]) -> float:
+    """The share of worlds at the start of the rules after a reset; the others are far from it."""
+    env.reset()
+    same = (env.physics.qpos - rules[0]).abs().amax(1) < 1e-6
+    assert (env.physics.qvel - rules[1])[same].abs().max() < 1e-6 if same.any() else True
+    assert torch.equal(env.view.clock == 0, same)
+    return float(same.float().mean())
 
 
 def test_everyone_in_a_crowd_plays_in_its_own_block():
