@@ -101,7 +101,7 @@ def opened(policy: Policy, share: Share) -> Iterator[Env]:
 
 
 def standing_starts(env: Env, noise: float) -> Starts:
-    """Agent 0 standing, with joint noise +-``noise`` (rad) that is another in every episode."""
+    """All standing, with joint noise +-``noise`` (rad) that is another in every episode."""
     scene = env.physics.scene
     qpos = torch.tensor(scene.default_qpos()[None, scene.agent_qpos(0)], dtype=torch.float32)
     qvel = torch.zeros(1, 6 + scene.body.num_dofs)

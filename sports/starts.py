@@ -40,7 +40,9 @@ class Starts:
     blocks: int = 1
     """The worlds come in so many blocks that draw the same frames, with the same noise."""
     noise: float = 0.0
-    """+- joint noise (rad), uniform, drawn anew with every frame."""
+    """+- joint noise (rad) of every athlete, uniform, drawn anew with every frame. With it on one of
+    two alone, a boxer won 47 of 100 bouts against itself and lost 25, or the other way round on
+    another processor."""
 
     def to(self, device: torch.device | str) -> Starts:
         """The same frames on a device."""
@@ -68,8 +70,8 @@ class Starts:
         q, v = scene.agent_qpos(0), scene.agent_qvel(0)
         state.qpos[:, q] = torch.where(use[:, None], self.qpos[frame], state.qpos[:, q])
         state.qvel[:, v] = torch.where(use[:, None], self.qvel[frame], state.qvel[:, v])
-        if self.noise > 0.0:
-            joints = state.qpos[:, q][:, 7:]
+        for agent in range(scene.num_agents if self.noise > 0.0 else 0):
+            joints = state.qpos[:, scene.agent_qpos(agent)][:, 7:]
             size = (each, joints.shape[1])
             draw = torch.rand(size, device=device, generator=generator).repeat(self.blocks, 1)
             joints += use[:, None] * self.noise * loose_joints(scene, device) * (2.0 * draw - 1.0)

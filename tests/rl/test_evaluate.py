@@ -148,6 +148,17 @@ def test_no_two_trials_begin_alike():
     assert stats.kstest(drawn, "uniform").pvalue > 1e-4
 
 
+def test_every_athlete_begins_anew():
+    share = Share("boxing", "mujoco", 60, 60, 0, "human", "paper", {})
+    with opened(load_policy("zero", "boxing"), share) as env:
+        env.reset()
+        scene = env.physics.scene
+        at = [env.physics.qpos[:, scene.agent_qpos(agent)][:, 7:] for agent in range(2)]
+        both = torch.stack([q - q.mean(0) for q in at])
+    assert ((both.abs().amax(1) > 0.01) & (both.abs().amax(1) < 0.03)).all()
+    assert float((both[0] * both[1]).mean() / both.square().mean()) < 0.05
+
+
 def test_recordings_are_the_episodes_they_name(played):
     returns = played.trials["return"]
     order = np.argsort(returns)  # no trial succeeds, so the return decides
