@@ -40,9 +40,7 @@ class Starts:
     blocks: int = 1
     """The worlds come in so many blocks that draw the same frames, with the same noise."""
     noise: float = 0.0
-    """+- joint noise (rad) of every athlete, uniform, drawn anew with every frame. With it on one of
-    two alone, a boxer won 47 of 100 bouts against itself and lost 25, or the other way round on
-    another processor."""
+    """+- joint noise (rad) of every athlete, uniform, drawn anew with every frame."""
 
     def to(self, device: torch.device | str) -> Starts:
         """The same frames on a device."""
