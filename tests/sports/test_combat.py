@@ -289,9 +289,12 @@ def test_a_referee_parts_who_hold_and_the_bout_goes_on(task):
     env.reset()
     scene, physics = env.physics.scene, env.physics
     guard = physics.qpos.clone()
+    bent = 0.8 * torch.randn(2, scene.body.num_dofs, generator=torch.Generator().manual_seed(0))
     state = PhysicsState(guard.clone(), torch.full_like(physics.qvel, 0.1), physics.mocap_pos)
     for agent in range(2):
-        state.qpos[0, scene.agent_qpos(agent).start] = (agent - 0.5) * 0.5
+        at = scene.agent_qpos(agent)
+        state.qpos[0, at.start] = (agent - 0.5) * 0.5
+        state.qpos[0, at.start + 7 : at.stop] += bent[agent]
     physics.reset(torch.ones(2, dtype=torch.bool), state)
     env.view.refresh()
     env.memory = env.task.begin(env.view, {}) | {"touches": torch.tensor([[2.0, 1.0]] * 2)}
@@ -304,6 +307,9 @@ def test_a_referee_parts_who_hold_and_the_bout_goes_on(task):
     assert last.move.mask.tolist() == [True, False]
     physics.move(last.move.mask, last.move.qpos, last.move.qvel)
     start = default_state(scene, 2, "cpu").qpos
+    for agent in range(2):  # back on guard but for 0.03 of the way, 0.02 rad at most
+        at = scene.agent_qpos(agent)
+        start[0, at.start + 7 : at.stop] += (0.03 * bent[agent]).clamp(-0.02, 0.02)
     torch.testing.assert_close(physics.qpos[0], start[0])
     assert torch.equal(physics.qpos[1], state.qpos[1]) and (physics.qvel[0] == 0.0).all()
     assert torch.equal(physics.qvel[1], state.qvel[1])
