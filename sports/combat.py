@@ -44,7 +44,7 @@ stepped apart, and the seconds of closeness from which they hold each other. Blo
 LEFT = 0.03
 """Of an athlete's pose, after a referee has parted it from the other, where it was before. Put back
 exactly, two of one policy are mirror images from then on, and what a bout comes to is the same in
-all bouts and decided by rounding: a boxer won 45 of 100 against itself and lost 25 on one
+all bouts and decided by rounding: a boxer won 44 of 100 against itself and lost 25 on one
 processor, and won 27 and lost 42 on another."""
 CREDIT = 1.0
 """Seconds after a weapon's contact with the opponent for which the opponent's fall is its doing."""
