@@ -40,7 +40,7 @@ class Starts:
     blocks: int = 1
     """The worlds come in so many blocks that draw the same frames, with the same noise."""
     noise: float = 0.0
-    """+- joint noise (rad) of every athlete, uniform, drawn anew with every frame."""
+    """+- joint noise (rad) of every start and athlete; see :func:`add_noise`."""
 
     def to(self, device: torch.device | str) -> Starts:
         """The same frames on a device."""
@@ -68,11 +68,8 @@ class Starts:
         q, v = scene.agent_qpos(0), scene.agent_qvel(0)
         state.qpos[:, q] = torch.where(use[:, None], self.qpos[frame], state.qpos[:, q])
         state.qvel[:, v] = torch.where(use[:, None], self.qvel[frame], state.qvel[:, v])
-        for agent in range(scene.num_agents if self.noise > 0.0 else 0):
-            joints = state.qpos[:, scene.agent_qpos(agent)][:, 7:]
-            size = (each, joints.shape[1])
-            draw = torch.rand(size, device=device, generator=generator).repeat(self.blocks, 1)
-            joints += use[:, None] * self.noise * loose_joints(scene, device) * (2.0 * draw - 1.0)
+        if self.noise > 0.0:
+            add_noise(state, scene, generator, self.noise, self.blocks)
         if self.object_qpos is not None and self.object_qvel is not None:
             free = len(scene.free_objects)
             if self.object_qpos.shape[1] != 7 * free:
@@ -89,12 +86,20 @@ class Starts:
         return {k: torch.where(use, c[frame], nan) for k, c in self.context.items()}
 
 
-def add_noise(state: PhysicsState, scene: Scene, generator: torch.Generator) -> None:
-    """Moves the joints of standing athletes a little."""
-    noise = START_NOISE * loose_joints(scene, state.qpos.device)
+def add_noise(
+    state: PhysicsState,
+    scene: Scene,
+    generator: torch.Generator,
+    most: float = START_NOISE,
+    blocks: int = 1,
+) -> None:
+    """Moves the joints of all athletes, uniformly by up to +-``most`` (rad): each world by other
+    numbers, or so many ``blocks`` of worlds by the same."""
+    noise = most * loose_joints(scene, state.qpos.device)
     for agent in range(scene.num_agents):
         joints = state.qpos[:, scene.agent_qpos(agent)][:, 7:]
-        draw = torch.rand(joints.shape, device=joints.device, generator=generator)
+        size = (len(joints) // blocks, joints.shape[1])
+        draw = torch.rand(size, device=joints.device, generator=generator).repeat(blocks, 1)
         joints += noise * (2.0 * draw - 1.0)
 
 
