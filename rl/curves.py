@@ -19,7 +19,7 @@ from warmstart.atomic import write_json
 
 POINTS = 40
 """Rows that are kept, the first and the last among them."""
-DIGITS = 6
+DIGITS = 4
 """Of every number that is not whole: more are noise, and most of the file."""
 KEPT = ("samples", "minutes", "return", "episode_steps", "samples_per_s", "nan_worlds", "overflow")
 KEPT += ("middle", "candidates")
@@ -63,7 +63,7 @@ def _number(text: str | None) -> float | None:
     value = float(text) if text else math.nan
     if not math.isfinite(value):
         return None
-    return value if value.is_integer() else float(f"{value:.{DIGITS}g}")
+    return int(value) if value.is_integer() else float(f"{value:.{DIGITS}g}")
 
 
 def main(args: Sequence[str]) -> int:

@@ -37,7 +37,14 @@ def test_rows_are_thinned_out_evenly_with_both_ends(tmp_path, rows, points, kept
     hits = [None if s // 1000 % 2 else s / 1e5 for s in samples]
     assert curve["rows"]["metrics/hit_rate"] == hits
     assert set(curve["rows"]) == {"samples", "return", "metrics/hit_rate"}
+    assert all(isinstance(s, int) for s in samples)
     assert curve["config"] == {"seed": 3} and curve["commit"] == "abc" and "obs" not in curve
+
+
+def test_numbers_that_are_not_whole_are_rounded(tmp_path):
+    (tmp_path / "p.csv").write_text("samples,return,metrics/success\n196608,1234567.5,0.66666667\n")
+    rows = json.loads(record_curve(tmp_path / "p.csv", CARD, tmp_path / "c.json").read_text())["rows"]
+    assert rows == {"samples": [196608], "return": [1235000.0], "metrics/success": [0.6667]}
 
 
 def test_the_command_takes_a_policy_with_its_curve(tmp_path, capsys):
