@@ -44,7 +44,11 @@ def test_rows_are_thinned_out_evenly_with_both_ends(tmp_path, rows, points, kept
 def test_numbers_that_are_not_whole_are_rounded(tmp_path):
     (tmp_path / "p.csv").write_text("samples,return,metrics/success\n196608,1234567.5,0.66666667\n")
     curve = json.loads(record_curve(tmp_path / "p.csv", CARD, tmp_path / "c.json").read_text())
-    assert curve["rows"] == {"samples": [196608], "return": [1235000.0], "metrics/success": [0.6667]}
+    assert curve["rows"] == {
+        "samples": [196608],
+        "return": [1235000.0],
+        "metrics/success": [0.6667],
+    }
 
 
 def test_the_command_takes_a_policy_with_its_curve(tmp_path, capsys):
