@@ -6,7 +6,6 @@ after its start, with the servos holding.
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,10 +18,9 @@ from olympics_opt.camera import Stand, shot, shots, stand
 from olympics_opt.episode import Episode, Player, decisive_window
 from olympics_opt.moments import events
 from olympics_opt.raycast import View
-from olympics_opt.render import font, labels, picture
+from olympics_opt.render import font, labels, picture, write_picture
 from olympics_opt.scenery import ground_marks
 from sports import hurdling
-from warmstart.atomic import write_bytes
 
 TILE, CAPTION = (480, 320), 30
 """Width and height of a picture, and of the strip under it (pixels)."""
@@ -103,11 +101,11 @@ def contact_sheet(
     columns: int = COLUMNS,
     tile: tuple[int, int] = TILE,
 ) -> Path:
-    """Draws one frame of each episode on one PNG.
+    """Draws one frame of each episode on one picture.
 
     Args:
         episodes: by the name that is written under the picture (a task's).
-        path: PNG file, written atomically.
+        path: PNG, JPEG or WebP file (`olympics_opt.render.write_picture`).
         notes: a few words beside a name.
         columns: pictures in a row.
         tile: width and height of a picture (pixels).
@@ -138,9 +136,7 @@ def contact_sheet(
         note = (notes or {}).get(name, "")
         place = (at[0] + tile[0] - 8, at[1] + tile[1] + 8)
         ink.text(place, note, font=font(13), fill=(110, 118, 126), anchor="ra")
-    buffer = io.BytesIO()
-    sheet.save(buffer, "PNG", optimize=True)
-    return write_bytes(path, buffer.getvalue())
+    return write_picture(sheet, path)
 
 
 def _view(player: Player, frame: int, tile: tuple[int, int]) -> View:

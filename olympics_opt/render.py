@@ -224,16 +224,24 @@ def render_sheet(
     for strip in strips:
         sheet.paste(strip, (0, y))
         y += strip.height
+    return write_picture(sheet, path)
+
+
+def write_picture(image: Any, path: str | Path) -> Path:
+    """Writes a picture (`PIL.Image`) as its name says: PNG, or for a page a JPEG or WebP of half
+    the width; atomically."""
+    from PIL import Image
+
     buffer = io.BytesIO()
     suffix = Path(path).suffix.lower()
     if suffix in (".jpg", ".webp"):
-        half = sheet.resize((sheet.width // 2, sheet.height // 2), Image.Resampling.LANCZOS)
+        half = image.resize((image.width // 2, image.height // 2), Image.Resampling.LANCZOS)
         if suffix == ".jpg":
             half.save(buffer, "JPEG", quality=65, optimize=True)
         else:
             half.save(buffer, "WEBP", quality=70, method=6)
     else:
-        sheet.save(buffer, "PNG", optimize=True)
+        image.save(buffer, "PNG", optimize=True)
     return write_bytes(path, buffer.getvalue())
 
 

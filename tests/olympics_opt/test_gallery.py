@@ -46,6 +46,8 @@ def test_few_tasks_make_a_narrow_sheet(tmp_path: Path) -> None:
     episodes = {name: still(scene_of(name), 2) for name in ("fencing", "boxing")}
     path = gallery.contact_sheet(episodes, tmp_path / "two.png", tile=(120, 80))
     assert pixels(path).shape == (80 + gallery.CAPTION, 240, 3)
+    path = gallery.contact_sheet(episodes, tmp_path / "two.webp", tile=(120, 80))
+    assert pixels(path).shape == ((80 + gallery.CAPTION) // 2, 120, 3)
     with pytest.raises(ValueError, match="at least one"):
         gallery.contact_sheet({}, tmp_path / "none.png")
 
@@ -69,7 +71,7 @@ def test_every_task_of_the_registry_is_drawn(
 
 
 def test_shipped_policies_are_preferred_and_the_weaker_athlete_first() -> None:
-    assert gallery.shipped("high_jump") == "pretrained:ppo-human"
+    assert gallery.shipped("high_jump") == "pretrained:latent-human"
     assert gallery.shipped("no_such_task") == "zero"
 
 
