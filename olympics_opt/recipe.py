@@ -22,19 +22,9 @@ def run_recipe(config: Recipe) -> int:
     print(_facts(card))
     run = f"runs/{config.name}"
     print("\n" + _wrapped([*_starter(card), config.name, "--out", run, *words]))
-    if card.get("averaged"):
-        print(
-            f"\nThe weights are the mean of {len(card['averaged'])} states: train --keep-policies, "
-            "export --mean."
-        )
-    if polished is not None:
-        start = [*_polisher(card["polish"]), config.name]
-        start += ["--policy", run, "--out", f"{run}_polished"]
-        episodes = f"{card['polish'].get('episodes', 0):,} episodes"
-        print(f"\nThen, {episodes} in all (say how many with --minutes or --generations):\n")
-        print(_wrapped([*start, *polished]))
-        if len(card["polish"].get("stages", ())) > 1:
-            print("That was its last stage of several.")
+    told = {"averaged": _mean(card), "polish": _polish(config.name, run, card, polished)}
+    for step in card:  # which has what was done to its weights in that order
+        print(told.get(step, ""), end="")
     if lacking := missing(card):
         text = f"Not in the project: {', '.join(lacking)}."
         if lacking[0] == card["config"].get("init"):
@@ -43,6 +33,27 @@ def run_recipe(config: Recipe) -> int:
     if card.get("history"):
         print("\n" + textwrap.fill(str(card["history"]), WIDTH, break_on_hyphens=False))
     return 0
+
+
+def _mean(card: dict[str, Any]) -> str:
+    """What became of several states, if the weights are their mean."""
+    if not card.get("averaged"):
+        return ""
+    states = f"the mean of {len(card['averaged'])} states"
+    return f"\nThe weights are {states}: train --keep-policies, export --mean.\n"
+
+
+def _polish(task: str, run: str, card: dict[str, Any], words: list[str] | None) -> str:
+    """The command of the last stage of a search, if there was one."""
+    if words is None:
+        return ""
+    start = [*_polisher(card["polish"]), task, "--policy", run, "--out", f"{run}_polished"]
+    episodes = f"{card['polish'].get('episodes', 0):,} episodes"
+    text = f"\nThen, {episodes} in all (say how many with --minutes or --generations):\n\n"
+    text += _wrapped([*start, *words]) + "\n"
+    if len(card["polish"].get("stages", ())) > 1:
+        text += "That was its last stage of several.\n"
+    return text
 
 
 def _card(config: Recipe) -> dict[str, Any]:

@@ -59,10 +59,11 @@ def mean_policy(policies: Sequence[Policy], shares: Sequence[float] | None = Non
         _same_kind(first, other)
     ways = Directions(base, [towards(first, other) for other in others])
     weights = ways.at(torch.tensor(parts[1:], dtype=torch.float64))
+    before = {key: told for key, told in first.metadata.items() if key != "averaged"}
     card = {
-        **first.metadata,
+        **before,
         "metrics": {},
-        "averaged": [
+        "averaged": [  # behind what was done before
             {"sha256": p.metadata["sha256"], "samples": p.metadata.get("samples"), "share": part}
             for p, part in zip(policies, parts)
         ],

@@ -531,10 +531,11 @@ def _save(
         "commit": provenance.commit(),
         "hardware": provenance.hardware(),
     }
+    before = {key: x for key, x in policy.metadata.items() if key != "polish"}
     card = {
-        **policy.metadata,
+        **before,
         "precision": "float16",
-        "polish": about | told,
+        "polish": about | told,  # behind what was done before
         "metrics": {},
     }
     write_policy(packed_weights(moved(middle, "cpu")), card, config.out / POLICY)

@@ -61,6 +61,13 @@ def test_the_commands_of_a_shipped_policy_give_its_settings(task: str, name: str
         assert json.loads(json.dumps(chosen)) == worlds.get("task", {})
 
 
+@pytest.mark.parametrize("task, first", [("high_jump", "mean"), ("long_jump", "polish")])
+def test_a_mean_is_told_before_a_polish_or_after_it_as_it_was(task: str, first: str, capsys):
+    text, _ = told(capsys, task, "--policy", "pretrained:latent")
+    mean, polish = text.index("The weights are the mean of"), text.index("Then, ")
+    assert (mean < polish) == (first == "mean")
+
+
 def test_two_kinds_of_worlds_want_two_processes(capsys):
     text, commands = told(capsys, "hurdling", "--policy", "pretrained:latent-varied")
     assert commands[0][:4] == ["torchrun", "--standalone", "--nproc-per-node", "2"]
