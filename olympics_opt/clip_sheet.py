@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,10 +12,9 @@ import numpy as np
 from olympics_opt.camera import side_views
 from olympics_opt.episode import Player
 from olympics_opt.raycast import draw
-from olympics_opt.render import font
+from olympics_opt.render import font, write_picture
 from sports.humanoid.body import load_body
 from sports.scene import Scene, humanoid_scene
-from warmstart.atomic import write_bytes
 from warmstart.clip import Clip
 
 TITLE = 30
@@ -35,7 +33,7 @@ def clip_sheet(
 
     Args:
         clips: by the words that are written above the row.
-        path: PNG file, written atomically.
+        path: PNG, JPEG or WebP file (`olympics_opt.render.write_picture`).
         columns: pictures in a row, at least 2.
         panel: width and height of a picture (pixels).
 
@@ -60,9 +58,7 @@ def clip_sheet(
             at = (k * panel[0], top + TITLE)
             sheet.paste(image, at)
             ink.text((at[0] + 6, at[1] + 4), f"{times[k]:.2f} s", font=font(13), fill=(40, 48, 56))
-    buffer = io.BytesIO()
-    sheet.save(buffer, "PNG", optimize=True)
-    return write_bytes(path, buffer.getvalue())
+    return write_picture(sheet, path)
 
 
 def _episode(scene: Scene, qpos: np.ndarray, dt: float) -> Any:

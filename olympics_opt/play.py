@@ -249,8 +249,9 @@ def _render_all(config: Render) -> int:
 
     if config.name or config.policy or config.sheet is not None:
         raise ValueError("--all draws every task: give no task, no --policy and no --sheet")
-    if config.out is None or config.out.suffix.lower() not in (".png", ".jpg", ".webp"):
-        raise ValueError("give --all a picture to write: --out sheet.png, or .jpg or .webp")
+    if config.out is None:
+        raise ValueError("give --all a picture to write: --out sheet.png")
+    check_pictures(None, config.out)
     print(f"wrote {render_all(config.out, config.seed)}")
     return 0
 
