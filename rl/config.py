@@ -217,6 +217,8 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
         yield f"own-ranks must not be negative: {c.own_ranks}"
     if c.own_ranks and are_own(c):
         yield "all processes play in the task's own worlds: leave --own-ranks out, or give --vary"
+    if c.hyper.anchor and c.init is None:
+        yield "--ppo.anchor holds an actor to the policy that it began as: give --init"
     if c.clone < 0:
         yield f"clone must not be negative: {c.clone}"
 

@@ -9,6 +9,7 @@ minibatch step is replayed as one CUDA graph. The formulas are in ``rl.ppo_losse
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, replace
 
@@ -91,6 +92,10 @@ class PPOConfig:
     thrower of 28 m throws 15 m and a hurdler that always finishes never does."""
     critic_warmup: int = 5
     """Iterations in which only the critic learns, after a start from a policy without one."""
+    anchor: float = 0.0
+    """Cost of each nat by which an actor that began as another policy diverges from that one,
+    beside advantages of unit deviation: where they say little it stays what it was, where they say
+    much it moves. 0 lets it go."""
 
     def kl_band_at(self, share: float) -> tuple[float, float] | None:
         """The band in the part of the run that is done, ``share`` in 0..1."""
@@ -108,14 +113,19 @@ class PPOConfig:
             raise ValueError("kl_band_final needs a kl_band to begin with")
         if min(self.steps, self.minibatches, self.epochs) < 1:
             raise ValueError("steps, minibatches and epochs must be at least 1")
+        if self.anchor < 0.0:
+            raise ValueError(f"anchor must not be negative: {self.anchor}")
+        if self.anchor > 0.0 and self.moving_statistics:
+            raise ValueError("moving_statistics would move the anchor too: leave one of them out")
 
 
 LESSON = 0.1
 """Weight of the divergence (nats) of parts without noise from their labels. At 1 the lesson's
 noise, not the rewards, decides where Adam steps."""
 
-STATISTICS = ("kl", "clip_fraction", "policy_loss", "value_loss", "bounds_loss")
-STATISTICS += ("explained_variance",)
+LOSSES = ("kl", "clip_fraction", "policy_loss", "value_loss", "bounds_loss", "anchor_loss")
+"""What a minibatch comes to."""
+STATISTICS = (*LOSSES, "explained_variance")
 """What ``PPO.update`` reports."""
 
 PAPER = replace(
@@ -210,7 +220,9 @@ class PPO:
             {"params": list(self.critic.parameters()), "lr": critic_rate},
         ]
         self.optimizer = torch.optim.Adam(groups, fused=True, capturable=cuda)
-        self._stats = torch.zeros(5, device=self.device)
+        self.anchor: MLP | None = None
+        """What the actor began as, if the configuration holds it there. Graphs read it."""
+        self._stats = torch.zeros(len(LOSSES), device=self.device)
         self._batch: dict[str, Tensor] = {}
         wanted = cuda_graph and cuda
         self._step: GraphedStep | SharedStep
@@ -293,7 +305,8 @@ class PPO:
         ``picks``: of its T M samples the indices of those to learn from, always as many (the others
         must not be ``valid``); None for all.
 
-        kl, clip_fraction, policy_loss, value_loss, bounds_loss: means over all minibatches;
+        kl, clip_fraction, policy_loss, value_loss, bounds_loss, and anchor_loss, the divergence
+        from what the actor began as (nats; 0 without an anchor): means over all minibatches;
         explained_variance: of the returns by the critic before the update.
         """
         c = self.config
@@ -366,8 +379,8 @@ class PPO:
         self._descend(self._backward(rows))
 
     def _backward(self, rows: Tensor) -> Tensor:
-        """Adds the gradients of the samples ``rows`` (m,). Returns their statistics: (5,) kl,
-        clip_fraction, policy_loss, value_loss, bounds_loss."""
+        """Adds the gradients of the samples ``rows`` (m,). Returns their statistics: (6,), in the
+        order of ``LOSSES``."""
         c, b = self.config, {name: x[rows] for name, x in self._batch.items()}
         weight = b["weight"]
         with self.autocast():
@@ -379,6 +392,13 @@ class PPO:
         error = clipped_value_error(value, b["target"], b["value"], c.value_clip)
         value_loss = (weight * error).mean()
         actor_loss = policy_loss + c.bounds_coefficient * bounds_loss
+        anchor_loss = torch.zeros_like(policy_loss)
+        if self.anchor is not None:
+            with torch.no_grad(), self.autocast():
+                first = self.anchor(b["obs"])
+            left = gaussian_divergence(mean, first, self.sigma, self.noisy)
+            anchor_loss = (weight * left).mean()
+            actor_loss = actor_loss + c.anchor * anchor_loss
         if self.labels is not None:
             taught = gaussian_divergence(mean, b["label"], self.sigma, 1.0 - self.noisy)
             actor_loss = actor_loss + LESSON * (weight * taught).mean()
@@ -387,11 +407,12 @@ class PPO:
             divergence = gaussian_divergence(mean, b["mean"], self.sigma, self.noisy)
             kl = (weight * divergence).mean()
             clipped = (weight * ((ratio - 1.0).abs() > c.clip_ratio)).mean()
-            return torch.stack((kl, clipped, policy_loss, value_loss, bounds_loss))
+            losses = (policy_loss, value_loss, bounds_loss, anchor_loss)
+            return torch.stack((kl, clipped, *losses))
 
     @torch.no_grad()
     def _descend(self, stats: Tensor) -> None:
-        """Steps along the gradients; ``stats`` (5,) of the samples decide the actor's rate."""
+        """Steps along the gradients; ``stats`` (6,) of the samples decide the actor's rate."""
         c = self.config
         adapted = adapted_rate(self.learning_rate, stats[0], c, self.kl_band)
         # A resting actor diverges from nothing: its rate must not climb meanwhile.
@@ -415,12 +436,17 @@ class PPO:
         state = learned_state(self._named_parameters(), self.optimizer)
         for part, norm in (("obs_norm", self.obs_norm), ("value_norm", self.value_norm)):
             state |= {f"{part}.{key}": x for key, x in norm.state_dict().items()}
+        if self.anchor is not None:
+            state |= {f"anchor.{name}": x for name, x in self.anchor.state_dict().items()}
         state |= {"sigma": self.sigma, "learning_rate": self.learning_rate}
         return state | {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Takes a state back. Raises ValueError where it does not fit."""
         load_learned(self._named_parameters(), self.optimizer, state)
+        first = {k.removeprefix("anchor."): x for k, x in state.items() if k.startswith("anchor.")}
+        if first:
+            self._hold_to(first)
         for part, norm in (("obs_norm", self.obs_norm), ("value_norm", self.value_norm)):
             keys = [k for k in ("total", "pending", "kept") if f"{part}.{k}" in state]
             norm.load_state_dict({key: state[f"{part}.{key}"] for key in keys})
@@ -437,10 +463,16 @@ class PPO:
             self.actor.load_state_dict(actor.state_dict())
         except RuntimeError as error:
             raise ValueError(f"the policy's network does not fit the run's: {error}") from error
+        if self.config.anchor > 0.0:
+            self._hold_to(self.actor.state_dict())
         self.obs_norm.set_moments(count, mean, std)
         self.keep_statistics(torch.ones_like(mean, dtype=torch.bool) if seen is None else seen)
         if self.config.kl_band is not None:
             self.learning_rate.clamp_(max=self.config.learning_rate_limits[0])
+
+    def _hold_to(self, weights: dict[str, Tensor]) -> None:
+        self.anchor = copy.deepcopy(self.actor).requires_grad_(False)
+        self.anchor.load_state_dict(weights)
 
     def keep_statistics(self, seen: Tensor) -> None:
         """Observation statistics of the features ``seen`` (D,) bool stay as they are, unless the

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from rl.ppo import PAPER, PPO, PPOConfig, adapted_rate, gaussian_log_prob, surrogate_loss
+from rl.ppo import LOSSES, PAPER, PPO, PPOConfig, adapted_rate, gaussian_log_prob, surrogate_loss
 from rl.rollout import Rollout
 from rl.train import train
 from tests.rl.toy import SMALL, A, B, Integrator, Q, R, optimal_cost, toy_config, toy_env
@@ -200,7 +200,8 @@ def test_rate_follows_the_divergence_within_its_limits():
 def test_the_band_moves_geometrically_and_the_control_follows_it():
     config = PPOConfig(kl_band=(0.04, 0.1), kl_band_final=(0.01, 0.025), learning_rate=1e-4)
     agent = PPO(3, 2, config)
-    stats = torch.tensor([0.03, 0.0, 0.0, 0.0, 0.0])  # below the first band, above the last one
+    # A divergence below the first band and above the last one.
+    stats = torch.tensor([0.03, *(len(LOSSES) - 1) * [0.0]])
     for share, low, direction in ((0.0, 0.04, 1), (0.5, 0.02, 0), (1.0, 0.01, -1)):
         agent.schedule(share)
         assert agent.kl_band.tolist() == pytest.approx([low, 2.5 * low])
@@ -253,6 +254,65 @@ def test_an_actor_that_begins_as_another_keeps_what_it_knows():
     fixed = PPO(40, 28, PPOConfig(hidden=(256, 128), kl_band=None))
     fixed.load_policy(teacher.actor, torch.zeros(40), torch.ones(40), 1e6)
     assert float(fixed.learning_rate) == pytest.approx(PPOConfig().learning_rate)
+
+
+def _paid_by_the_action(agent: PPO, updates: int) -> float:
+    """Updates where the action itself is the reward and ends the episode; the mean's way."""
+    agent.load_policy(PPO(3, 1, agent.config, seed=4).actor, torch.zeros(3), torch.ones(3), 1e6)
+    rollout, raw = filled_rollout(agent, 512, seed=5, spread=0.0)
+    g = torch.Generator().manual_seed(6)
+    begun = float(rollout.mean.mean())
+    for _ in range(updates):
+        with torch.no_grad():
+            rollout.mean.copy_(agent.actor(agent.prepare(raw)))
+        noise = torch.randn(rollout.mean.shape, generator=g)
+        rollout.action.copy_(rollout.mean + agent.sigma * noise)
+        rollout.log_prob.copy_(gaussian_log_prob(rollout.action, rollout.mean, agent.sigma))
+        rollout.reward.copy_(rollout.action.squeeze(-1))
+        rollout.terminated.fill_(True)
+        rollout.valid.fill_(True)
+        agent.update(rollout)
+    with torch.no_grad():
+        return float(agent.actor(agent.prepare(raw)).mean()) - begun
+
+
+def test_an_anchored_actor_stops_where_the_closed_form_says():
+    """Paid by a itself, the advantage of unit deviation is (a - mean) / sigma, whose policy
+    gradient is 1 / sigma; the anchor's is weight (mean - first) / sigma^2: they meet at
+    sigma / weight."""
+    config = PPOConfig(
+        hidden=(16,), steps=4, minibatches=1, epochs=1, kl_band=None, learning_rate=1e-3, sigma=0.1
+    )
+    ways = {}
+    for weight in (0.0, 1.0, 4.0):
+        agent = PPO(3, 1, dataclasses.replace(config, anchor=weight), seed=4)
+        ways[weight] = _paid_by_the_action(agent, 150)
+    print(ways)
+    assert ways[1.0] == pytest.approx(0.1, rel=0.1)
+    assert ways[4.0] == pytest.approx(0.025, rel=0.15)
+    assert ways[0.0] > 0.3
+
+
+def test_an_anchor_survives_a_checkpoint():
+    config = PPOConfig(hidden=(16,), steps=4, minibatches=2, epochs=2, anchor=0.5)
+    agent, resumed = PPO(3, 2, config, seed=1), PPO(3, 2, config, seed=7)
+    agent.load_policy(PPO(3, 2, config, seed=2).actor, torch.zeros(3), torch.ones(3), 1e6)
+    rollout, _ = filled_rollout(agent, 40, seed=2)
+    assert float(agent.update(rollout)["anchor_loss"]) > 0.0
+    resumed.load_state_dict({name: x.clone() for name, x in agent.state_dict().items()})
+    after = [{k: float(x) for k, x in a.update(rollout).items()} for a in (agent, resumed)]
+    assert after[0] == after[1]
+    free = PPO(3, 2, dataclasses.replace(config, anchor=0.0), seed=2)
+    assert float(free.update(rollout)["anchor_loss"]) == 0.0
+
+
+def test_an_anchor_that_cannot_hold_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="anchor must not be negative"):
+        PPOConfig(anchor=-1.0)
+    with pytest.raises(ValueError, match="moving_statistics would move the anchor"):
+        PPOConfig(anchor=1.0, moving_statistics=True)
+    with pytest.raises(ValueError, match="give --init"):
+        toy_config(tmp_path, ppo=PPOConfig(anchor=1.0))
 
 
 def test_paper_preset_is_the_papers_table():
