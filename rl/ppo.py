@@ -221,7 +221,7 @@ class PPO:
         ]
         self.optimizer = torch.optim.Adam(groups, fused=True, capturable=cuda)
         self.anchor: MLP | None = None
-        """What the actor began as, if the configuration holds it there. Graphs read it."""
+        """What the actor began as, if the configuration holds it there."""
         self._stats = torch.zeros(len(LOSSES), device=self.device)
         self._batch: dict[str, Tensor] = {}
         wanted = cuda_graph and cuda
@@ -364,6 +364,9 @@ class PPO:
         }
         if self.labels is not None:
             batch["label"] = self.labels
+        if self.anchor is not None:
+            with torch.no_grad(), self.autocast():
+                batch["first_mean"] = self.anchor(r.obs)
         for name, x in batch.items():
             flat = x.flatten(0, 1)
             if name in ("obs", "action", "mean", "log_prob", "label"):
@@ -394,9 +397,7 @@ class PPO:
         actor_loss = policy_loss + c.bounds_coefficient * bounds_loss
         anchor_loss = torch.zeros_like(policy_loss)
         if self.anchor is not None:
-            with torch.no_grad(), self.autocast():
-                first = self.anchor(b["obs"])
-            left = gaussian_divergence(mean, first, self.sigma, self.noisy)
+            left = gaussian_divergence(mean, b["first_mean"], self.sigma, self.noisy)
             anchor_loss = (weight * left).mean()
             actor_loss = actor_loss + c.anchor * anchor_loss
         if self.labels is not None:
