@@ -103,9 +103,8 @@ class Hurdling:
     the start. With 1, as without the curriculum, all worlds run side by side until the time limit
     has parted them, after 600 steps: before that every update learns from one part of the race, so
     let the critic learn alone (``--ppo.critic-warmup``). Whoever starts at hurdle k sees the boards
-    before it on the ground, and what it learns there is not all of use in the race: shown them
-    standing, as in the race, after its first hurdle, ``pretrained:latent`` loses 13 of 702 instead
-    of 33 of 710, and ``pretrained:latent-varied`` 34 of 706 instead of 5 of 702."""
+    before it on the ground, and what it learns there is not all of use in the race, which has them
+    standing behind it (docs/runs.md, "Two races in one task")."""
     toppling: bool = False
     """Hurdles are free bodies that fall when hit. Their height is then that of the race or
     ``height`` in training too: a hurdle that stands on the ground cannot be sunk into it."""
