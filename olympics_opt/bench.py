@@ -59,6 +59,9 @@ class BenchConfig:
     """Time limit of this call for each endurance run."""
     processes: int = 1
     """Processes that share out the worlds of an endurance run, each on a GPU of its own."""
+    shares: tuple[int, ...] = ()
+    """Of these processes only some, numbered from 0, the others in other calls with the same
+    ``keep``: where there are fewer GPUs, or less time. The last of them gives the row."""
     keep: Path | None = None
     """Folder in which endurance runs keep their worlds, so that the same command goes on."""
 
@@ -163,6 +166,7 @@ def soak_all(
     minutes: float | None = None,
     keep: Path | None = None,
     processes: int = 1,
+    shares: Sequence[int] = (),
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Plays every task for a long time under random actions and writes what happened as JSON.
@@ -173,7 +177,8 @@ def soak_all(
 
     Arguments as of :func:`bench`; ``steps``: control steps of each world; ``minutes``: of each task
     in this call; ``keep``: folder of the worlds of tasks that are to go on; ``processes``: that
-    share out the worlds, each on a GPU of its own.
+    share out the worlds, each on a GPU of its own; ``shares``: those of them that play now (there
+    is no row until all have).
 
     Raises:
         ValueError: unknown task or engine, or counts that are not positive.
@@ -210,8 +215,15 @@ def soak_all(
                         on_step=show,
                         keep=None if keep is None else keep / f"{task}_{engine}_{count}",
                         minutes=minutes,
+                        shares=shares,
                     )
                     progress.remove_task(bar)
+                    if found is None:
+                        console.print(
+                            f"{task} on {engine}: kept in {keep}; go on with other --shares, "
+                            f"until all of 0 to {processes - 1} are there"
+                        )
+                        continue
                     row = kept[task, engine, count] = asdict(found) | {
                         "clean": found.clean,
                         "seed": seed,
@@ -286,6 +298,7 @@ def main(args: Sequence[str] | None = None) -> int:
             minutes=config.minutes,
             keep=config.keep,
             processes=config.processes,
+            shares=config.shares,
         )
         return 0
     bench(

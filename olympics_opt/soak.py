@@ -6,6 +6,7 @@ buffers that overflow, rewards or observations of absurd size, and memory that g
 
 from __future__ import annotations
 
+import json
 import math
 import multiprocessing
 import time
@@ -23,6 +24,7 @@ from olympics_opt.meter import device_name, resident_gib
 from rl.checkpoint import checkpoints, load_checkpoint, save_checkpoint
 from rl.host import threads_of_each
 from sports.env import Env, make_env
+from warmstart.atomic import write_json
 
 STEPS = 10_000
 SIGMA = 0.3
@@ -182,19 +184,27 @@ def soak_shared(
     on_step: Callable[[int], None] | None = None,
     keep: Path | None = None,
     minutes: float | None = None,
-) -> Soak:
+    shares: Sequence[int] = (),
+) -> Soak | None:
     """:func:`soak` with the worlds shared out among processes, each on a GPU of its own where the
     engine needs one.
 
     Every process has its own seed, from ``seed`` on. ``keep`` gets a folder of each; ``on_step`` is
-    called with the mean of their steps.
+    called with the mean of their steps. ``shares``, numbered from 0: only these are played now, the
+    others in other calls with the same ``keep``, where ``soak.json`` says what each came to. Until
+    all are there the result is None.
 
     Raises:
-        ValueError: as :func:`soak`; fewer worlds than processes, no process, or a folder that keeps
-            the shares of another number of them.
+        ValueError: as :func:`soak`; fewer worlds than processes, no process, a folder that keeps
+            the shares of another number of them, or shares that there are not or that nothing
+            keeps.
         CheckpointError: as :func:`soak`.
-        RuntimeError: as :func:`soak`; fewer GPUs than processes.
+        RuntimeError: as :func:`soak`; fewer GPUs than processes at the same time.
     """
+    if shares and keep is None:
+        raise ValueError("shares that are played apart must be kept: give a folder")
+    if shares and not set(shares) <= set(range(processes)):
+        raise ValueError(f"shares of {processes} processes are 0 to {processes - 1}, not {shares}")
     if processes == 1:
         return soak(
             task,
@@ -208,37 +218,64 @@ def soak_shared(
         )
     if not 1 <= processes <= worlds:
         raise ValueError(f"{worlds} worlds cannot be shared out among {processes} processes")
+    played = sorted(set(shares)) or list(range(processes))
     gpus = torch.cuda.device_count() if engine == "warp" else 0
-    if 0 < gpus < processes:
-        raise RuntimeError(f"{processes} processes need a GPU each; here are {gpus}")
-    if keep is not None and (there := len(list(keep.glob("share_*")))) not in (0, processes):
-        raise ValueError(f"'{keep}' keeps the shares of {there} processes, not of {processes}")
-    shares = [worlds // processes + (i < worlds % processes) for i in range(processes)]
+    if 0 < gpus < len(played):
+        raise RuntimeError(f"{len(played)} processes need a GPU each; here are {gpus}")
+    folders = (
+        None if keep is None else [keep / f"share_{i}_of_{processes}" for i in range(processes)]
+    )
+    for folder in () if keep is None else keep.glob("share_*"):
+        if folder not in (folders or ()):
+            there = folder.name.rpartition("_")[2]
+            raise ValueError(f"'{keep}' keeps the shares of {there} processes, not of {processes}")
     context = multiprocessing.get_context("spawn")
     taken = context.Array("q", processes)
     with ProcessPoolExecutor(
-        processes, mp_context=context, initializer=_count_in, initargs=(taken,)
+        len(played), mp_context=context, initializer=_count_in, initargs=(taken,)
     ) as pool:
-        futures = [
-            pool.submit(
+        futures = {
+            i: pool.submit(
                 _soak_share,
                 i,
-                i if gpus else None,
+                gpu if gpus else None,
                 task,
                 engine,
-                worlds=share,
+                worlds=worlds // processes + (i < worlds % processes),
                 steps=steps,
                 seed=seed + i,
-                physics_options=threads_of_each(engine, processes),
-                keep=None if keep is None else keep / f"share_{i}",
+                physics_options=threads_of_each(engine, len(played)),
+                keep=None if folders is None else folders[i],
                 minutes=minutes,
             )
-            for i, share in enumerate(shares)
-        ]
-        while wait(futures, timeout=LOOK_SECONDS).not_done:
+            for gpu, i in enumerate(played)
+        }
+        while wait(futures.values(), timeout=LOOK_SECONDS).not_done:
             if on_step is not None:
-                on_step(sum(taken[:]) // processes)
-    return together([future.result() for future in futures])
+                on_step(sum(taken[:]) // len(played))
+    found = {i: future.result() for i, future in futures.items()}
+    if shares and folders is not None:
+        about = {"task": task, "engine": engine, "worlds": worlds, "seed": seed}
+        for i, share in found.items():
+            write_json(folders[i] / _SHARE, {"of": about, "soak": asdict(share)})
+        found |= {i: _kept_share(folders[i], about) for i in range(processes) if i not in found}
+    there = [each for i in range(processes) if (each := found[i]) is not None]
+    return together(there) if len(there) == processes else None
+
+
+_SHARE = "soak.json"
+"""In the folder of a share that was played apart: what it came to."""
+
+
+def _kept_share(folder: Path, about: dict[str, Any]) -> Soak | None:
+    """A share that another call has played; None where none has."""
+    path = folder / _SHARE
+    if not path.is_file():
+        return None
+    kept = json.loads(path.read_text())
+    if kept["of"] != about:
+        raise ValueError(f"'{folder}' keeps another endurance run: give another folder")
+    return Soak(**kept["soak"])
 
 
 _taken: Any = None

@@ -115,6 +115,8 @@ def assemble(config: TrainConfig, starts: Starts | None, make: MakeEnv) -> Assem
         starts = _starts_of_clips(config)
     if starts is not None:
         env.starts = starts.to(env.device)
+    if config.retries.share > 0.0:
+        env.retry(config.retries)
     parts: list[Part] = []
     if config.imitation > 0.0:
         if starts is None:

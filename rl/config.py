@@ -21,6 +21,7 @@ from rl.worlds import mistakes as world_mistakes
 from sports.env import Starts
 from sports.physics.variation import Variation
 from sports.registry import get_task, task_names
+from sports.retries import Retries
 
 DEFAULT_WORLDS = {"mujoco": 256, "warp": 8192, "drake": 4}
 DEFAULT_SAMPLES = 100_000_000
@@ -107,6 +108,8 @@ class TrainConfig:
     """How, with ``--prior``."""
     start_probability: tuple[float, float] = (0.5, 0.1)
     """Share of episodes that start from a demonstration, at the beginning and end of the run."""
+    retries: Retries = field(default_factory=Retries)
+    """Episodes that begin shortly before an earlier one failed."""
     imitation: float = 0.0
     """Reward per step for moving exactly like the demonstrations; fades to 0 over
     ``imitation_share`` of the run."""
@@ -219,6 +222,8 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
         yield "all processes play in the task's own worlds: leave --own-ranks out, or give --vary"
     if c.hyper.anchor and c.init is None:
         yield "--ppo.anchor holds an actor to the policy that it began as: give --init"
+    if c.retries.share and (c.contested or c.clone or c.task in APART):
+        yield "retries are for one athlete who learns a sport: leave --retries.share out"
     if c.clone < 0:
         yield f"clone must not be negative: {c.clone}"
 
@@ -324,6 +329,7 @@ def config_from_dict(data: dict[str, Any]) -> TrainConfig:
         latent = LatentConfig(**data.pop("latent", {}))
         spans = with_tuples(data.pop("variation", {}))
         how = {"ppo": PPOConfig(**ppo), "amp": AMPConfig(**amp), "latent": latent}
+        how["retries"] = Retries(**with_tuples(data.pop("retries", {})))
         vary = Variation(**spans)
         return TrainConfig(**data, **how, variation=vary, selfplay=SelfPlayConfig(**rivals))
     except (TypeError, KeyError) as error:

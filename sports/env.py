@@ -19,6 +19,7 @@ from sports.frames import proprioception, proprioception_slices
 from sports.humanoid.body import Limits, Strength, load_body
 from sports.physics import Physics, PhysicsState, default_state, make_physics
 from sports.registry import get_task, make_config
+from sports.retries import Failures, Retries
 from sports.scene import Scene, finer
 from sports.starts import ELAPSED, Starts, Stock, add_noise
 from sports.task import Memory, Task, View, falling_forces, falling_heights
@@ -30,6 +31,8 @@ take a tenth less time on a CPU (a GPU does not wait for them); unlike those of
 ``torch.inference_mode`` the results are plain tensors."""
 
 _PHYSICS = tuple(f.name for f in dataclasses.fields(PhysicsState))
+SAVED = "saved"
+"""Metric of episodes that begin before a failure: whether they end in success."""
 
 
 @dataclass
@@ -137,6 +140,7 @@ class Env:
         self.keep_snapshot = False
         self.obs_slices: dict[str, slice] = {}
         self._shown = torch.zeros(0, device=self.device)
+        self._failures: Failures | None = None
         obs = self.reset()
         self.obs_size = obs.shape[-1]
 
@@ -150,6 +154,16 @@ class Env:
         joint's own turn; None for the athlete's own."""
         self.layer, self.own_turns = layer, layer is not None
         self.action_size = self.physics.scene.body.num_dofs if layer is None else layer.size
+
+    def retry(self, how: Retries) -> None:
+        """From now on a share of the episodes begins before an earlier one failed. The metrics are
+        those of the others, and ``SAVED`` that of these. Raises ValueError for several athletes in
+        a world, and for times that hold no moment."""
+        if self.num_agents > 1:
+            raise ValueError("one athlete's failure is another's success: retries are for one")
+        self._failures = Failures(how, self._moment(), self.view.control_timestep)
+        self._stock, self._stocks = None, False
+        self.metric_names = (*self.metric_names, SAVED)
 
     def reset(self) -> Tensor:
         """Resets every world; (N, A, obs)."""
@@ -232,8 +246,16 @@ class Env:
         if step.remaining_paid is not None:
             left = (self.max_steps - self.view.clock).clamp(min=0).float()
             remaining = torch.where(step.remaining_paid & terminated.all(-1), left, remaining)
+        metrics, counted = step.metrics, over
+        if self._failures is not None:
+            retried = self._failures.retried
+            counted = over & ~retried
+            metrics = {k: v.masked_fill(retried, torch.nan) for k, v in metrics.items()}
+            metrics[SAVED] = step.success.float().masked_fill(~retried, torch.nan)
+            failed = terminated.any(-1) & ~step.success
+            self._failures.watch(failed, self._moment(), self.generator)
         if self.task.promote is not None:
-            self.view.curriculum = self.task.promote(self.view, self.memory, step, over)
+            self.view.curriculum = self.task.promote(self.view, self.memory, step, counted)
 
         if self._stocks:
             # On a CPU, asking which worlds ended costs nothing and saves the work.
@@ -251,19 +273,35 @@ class Env:
             truncated=truncated,
             valid=valid,
             remaining_paid=remaining,
-            metrics=step.metrics,
+            metrics=metrics,
             outcome=step.outcome,
         )
 
     def _reset(self, mask: Tensor) -> None:
+        if self._failures is not None and self.device.type == "cpu" and not mask.any():
+            return  # not worth a draw for every world
         state, context = self._draw()
+        begun, past = self._clock(context), {}
+        if self._failures is not None:
+            again, past = self._failures.draw(mask, self.generator)
+            drawn = {k: v for k, v in vars(state).items() if v is not None}
+            state = PhysicsState(**_renewed(again, {k: past[k] for k in drawn}, drawn))
+            begun = torch.where(again, past["clock"], begun)
         self.physics.reset(mask, state)
-        begun = self._clock(context)
         self.view.clock = torch.where(mask, begun, self.view.clock)
         self.age = torch.where(mask, begun, self.age)
         self.view.refresh()
         fresh = self.task.begin(self.view, context)
+        if past:
+            fresh = _renewed(again, {k: past[f"memory/{k}"] for k in fresh}, fresh)
         self.memory = _renewed(mask, fresh, self.memory or fresh)
+
+    def _moment(self) -> Memory:
+        """What an episode can go on from in any world of the task: (N, ...) by name."""
+        names = (k for k, v in vars(self._default).items() if v is not None)
+        physics = {k: getattr(self.physics, k) for k in names}
+        memory = {f"memory/{k}": v for k, v in self.memory.items()}
+        return {**physics, "clock": self.view.clock, **memory}
 
     def _restart(self, mask: Tensor, worlds: Tensor, obs: Tensor) -> Tensor:
         """Resets worlds, as a mask and by index, from the stock; ``obs`` with their new rows."""
@@ -359,6 +397,8 @@ class Env:
             state |= {f"physics/{k}": v for k, v in extra().items()}
         if self._stock is not None:
             state |= {f"stock/{k}": v for k, v in self._stock.state_dict().items()}
+        if self._failures is not None:
+            state |= {f"failures/{k}": v for k, v in self._failures.state_dict().items()}
         state |= {f"memory/{k}": v.clone() for k, v in self.memory.items()}
         state |= {f"curriculum/{k}": v.clone() for k, v in self.curriculum.items()}
         return state
@@ -381,6 +421,9 @@ class Env:
         self.view.clock, self.age = moved["clock"].clone(), moved["age"].clone()
         self.memory = {k[7:]: v.clone() for k, v in moved.items() if k.startswith("memory/")}
         self._load_stock({k[6:]: v for k, v in moved.items() if k.startswith("stock/")})
+        if self._failures is not None:
+            found = {k[9:]: v for k, v in moved.items() if k.startswith("failures/")}
+            self._failures.load_state_dict(found)
         self.generator.set_state(moved["generator"].cpu())
         self.view.curriculum = {k[11:]: v for k, v in moved.items() if k.startswith("curriculum/")}
         self.view.refresh()

@@ -254,6 +254,31 @@ def test_an_endurance_run_shared_out_is_the_sum_of_its_shares(
             soak_shared("long_jump", "mujoco", worlds=5, processes=count)
 
 
+def test_shares_played_one_after_another_are_those_played_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    common = {"worlds": 5, "processes": 2, "steps": 60, "seed": 3}
+    together = soak_shared("long_jump", "mujoco", **common)
+    keep, out = tmp_path / "worlds", tmp_path / "soak.json"
+    words = ["--soak", "--task", "long_jump", "--engine", "mujoco", "--worlds", "5", "--steps"]
+    words += ["60", "--seed", "3", "--processes", "2", "--out", str(out), "--keep", str(keep)]
+    assert bench.main([*words, "--shares", "1"]) == 0
+    assert not out.exists() and "until all of 0 to 1" in " ".join(capsys.readouterr().out.split())
+    assert bench.main([*words, "--shares", "0"]) == 0
+    (row,) = json.loads(out.read_text())["soak"]
+    for name in ("worlds", "processes", "steps", "episodes", "largest_observation", "overflows"):
+        assert row[name] == getattr(together, name), name
+    folder = {"keep": keep / "long_jump_mujoco_5"}
+    with pytest.raises(ValueError, match="another endurance run"):
+        soak_shared("long_jump", "mujoco", shares=(0,), **(common | folder | {"seed": 2}))
+    with pytest.raises(ValueError, match="the shares of 2 processes, not of 3"):
+        soak_shared("long_jump", "mujoco", shares=(0,), **(common | folder | {"processes": 3}))
+    with pytest.raises(ValueError, match="must be kept"):
+        soak_shared("long_jump", "mujoco", shares=(0,), **common)
+    with pytest.raises(ValueError, match="are 0 to 1, not"):
+        soak_shared("long_jump", "mujoco", shares=(2,), **(common | folder))
+
+
 def test_a_soak_counts_what_goes_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A task that gives NaN in one of its features now and then, and a reward that is infinite."""
     from sports import long_jump, registry

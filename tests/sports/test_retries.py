@@ -1,0 +1,135 @@
+"""Episodes that begin before an earlier one failed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from sports.env import SAVED, Env, make_env
+from sports.retries import EVERY, SIZE, Failures, Retries
+
+TENTH = 0.1
+"""Seconds of a step here."""
+
+
+def moments(worlds: int, step: int) -> dict[str, torch.Tensor]:
+    """In which every number tells the step and the world."""
+    at = torch.full((worlds,), step)
+    return {
+        "clock": at,
+        "odd": at % 2 == 1,
+        "place": (1000.0 * torch.arange(worlds) + step)[:, None, None].expand(-1, 2, 1),
+    }
+
+
+@pytest.mark.parametrize("fails_at", range(61, 61 + EVERY))
+def test_a_moment_lies_as_long_before_the_failure_as_asked(fails_at):
+    how, worlds = Retries(share=0.99, seconds=(1.5, 4.2)), 200
+    failures, generator = Failures(how, moments(worlds, 0), TENTH), torch.Generator()
+    nobody = torch.zeros(worlds, dtype=torch.bool)
+    for step in range(1, fails_at + 1):
+        failed = nobody if step < fails_at else torch.arange(worlds) < 150
+        failures.watch(failed, moments(worlds, step), generator)
+    assert failures.count == 150
+    again, past = failures.draw(~nobody, generator)
+    assert 180 < again.sum() <= worlds
+    lag = fails_at - past["clock"]
+    kept = {n for n in range(15, 43) if (fails_at - n) % EVERY == 0}
+    assert set(lag.tolist()) == kept
+    assert torch.equal(past["odd"], past["clock"] % 2 == 1)
+    world, step = past["place"][:, 0, 0] // 1000, past["place"][:, 0, 0] % 1000
+    assert torch.equal(step.long(), past["clock"]) and world.max() < 150
+    assert len(world.unique()) > 50 and past["place"].shape == (worlds, 2, 1)
+    assert torch.equal(failures.retried, again) and not failures.since.any()
+
+
+def test_what_fails_soon_after_it_began_is_no_lesson_and_new_failures_replace_old_ones():
+    worlds = 700
+    failures = Failures(Retries(0.5, (0.0, 1.0)), moments(worlds, 0), TENTH)
+    generator, everyone = torch.Generator(), torch.ones(worlds, dtype=torch.bool)
+    steps = [10, 25, 45]  # since the last reset: 10, 15, 20
+    for step in range(1, 46):
+        failed = everyone if step in steps else ~everyone
+        failures.watch(failed, moments(worlds, step), generator)
+        if step in steps:
+            failures.draw(everyone, generator)
+    assert failures.count == 2 * worlds
+    _, past = failures.draw(everyone, generator)
+    after = failures.bank[:SIZE, 0]
+    # The last 700 are all of the last failure, and 324 places hold some of the one before.
+    assert (after > 25).sum() == worlds and ((after >= 15) & (after < 25)).sum() == SIZE - worlds
+    assert (past["clock"] < 45).all()
+
+
+def test_times_that_hold_no_moment_are_refused():
+    for seconds in ((0.5, 1.3), (2.0, 2.5)):
+        with pytest.raises(ValueError, match="a moment is kept every 1 s"):
+            Failures(Retries(0.5, seconds), moments(2, 0), TENTH)
+    for wrong in (dict(share=1.0), dict(share=-0.1), dict(seconds=(-1.0, 2.0))):
+        with pytest.raises(ValueError, match="retries"):
+            Retries(**wrong)
+    with pytest.raises(ValueError, match="before a failure, not 3"):
+        Retries(0.5, (3.0, 2.0))
+
+
+def hurdlers(seed: int = 3) -> Env:
+    env = make_env("hurdling", num_worlds=16, seed=seed, options={"height": 0.5})
+    env.retry(Retries(0.9, (0.1, 0.45)))
+    return env
+
+
+def test_an_athlete_begins_where_another_was_and_its_metrics_are_apart():
+    env = hurdlers()
+    generator = torch.Generator().manual_seed(0)
+    been: dict[tuple[int, ...], dict[str, torch.Tensor]] = {}
+    begun = saved = ended = 0
+    for _ in range(150):
+        action = 0.3 * torch.randn(16, 1, env.action_size, generator=generator)
+        before = env._failures.retried.clone()
+        env.keep_snapshot = True
+        result = env.step(action)
+        assert torch.equal(result.metrics[SAVED].isnan(), ~before)
+        assert result.metrics["distance"].isnan().equal(before)
+        saved += int(result.metrics[SAVED].nan_to_num().sum())
+        ended += int((result.ended & before).sum())
+        fresh = (result.ended & env._failures.retried).nonzero()[:, 0].tolist()
+        now = env.state_dict()
+        for w in fresh:
+            past = been[tuple(now["qpos"][w, :3].view(torch.int32).tolist())]
+            for name, value in past.items():
+                torch.testing.assert_close(now[name][w], value, rtol=0, atol=0, equal_nan=True)
+            assert env.age[w] == env.view.clock[w]
+            begun += 1
+        for w in range(16):
+            if not result.ended[w]:
+                row = {k: now[k][w].clone() for k in now if k.startswith("memory/")}
+                row |= {k: now[k][w].clone() for k in ("qpos", "qvel", "mocap_pos", "clock")}
+                been[tuple(now["qpos"][w, :3].view(torch.int32).tolist())] = row
+    assert begun > 20 and ended > 10 and saved == 0  # nobody comes to the finish
+    env.close()
+
+
+def test_a_state_that_is_taken_back_goes_on_alike():
+    env, other = hurdlers(), hurdlers(seed=4)
+    generator = torch.Generator().manual_seed(0)
+    actions = 0.3 * torch.randn(160, 16, 1, env.action_size, generator=generator)
+    for action in actions[:100]:
+        env.step(action)
+    assert env._failures.count > 0
+    other.load_state_dict(env.state_dict())
+    for action in actions[100:]:
+        assert torch.equal(env.step(action).obs, other.step(action).obs)
+    banks = (each._failures.bank for each in (env, other))
+    torch.testing.assert_close(*banks, rtol=0, atol=0, equal_nan=True)
+    plain = make_env("hurdling", num_worlds=16, seed=3)
+    with pytest.raises(ValueError, match="the failures are of another task"):
+        env.load_state_dict(plain.state_dict())
+    for each in (env, other, plain):
+        each.close()
+
+
+def test_retries_are_for_one_athlete():
+    env = make_env("boxing", num_worlds=2)
+    with pytest.raises(ValueError, match="retries are for one"):
+        env.retry(Retries(0.5))
+    env.close()
