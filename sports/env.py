@@ -253,7 +253,7 @@ class Env:
             metrics = {k: v.masked_fill(retried, torch.nan) for k, v in metrics.items()}
             metrics[SAVED] = step.success.float().masked_fill(~retried, torch.nan)
             failed = terminated.any(-1) & ~step.success
-            self._failures.watch(failed, self._moment(), self.generator)
+            self._failures.watch(over, failed, self._moment(), self.generator)
         if self.task.promote is not None:
             self.view.curriculum = self.task.promote(self.view, self.memory, step, counted)
 

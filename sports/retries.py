@@ -32,6 +32,9 @@ class Retries:
     seconds: tuple[float, float] = (0.5, 3.0)
     """How long before the failure, drawn evenly. An episode that fails sooner than the longest
     after it began is no lesson: nor is one that fails once more where it did."""
+    even: bool = False
+    """Draw all moments alike. Else those more often that are saved now and then, by the variance
+    of that outcome, p (1 - p): from where nobody can be saved, or anybody, little is learned."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.share < 1.0:
@@ -39,6 +42,9 @@ class Retries:
         first, last = self.seconds
         if not 0.0 <= first <= last:
             raise ValueError(f"retries begin 0 s or more before a failure, not {first} to {last}")
+
+
+_KEPT = ("past", "since", "retried", "bank", "count", "number", "tries", "saves", "place", "begun")
 
 
 class Failures:
@@ -78,9 +84,22 @@ class Failures:
         """(SIZE + 1, K) moments before failures; the last row is for those that are none."""
         self.count = torch.zeros((), dtype=torch.long, device=device)
         """() how many have been put there."""
+        self.number = torch.zeros(SIZE + 1, dtype=torch.long, device=device)
+        """(SIZE + 1,) which of these each is, from 1 on."""
+        self.tries = torch.zeros(SIZE + 1, device=device)
+        """(SIZE + 1,) episodes that began from it and are over."""
+        self.saves = torch.zeros(SIZE + 1, device=device)
+        """(SIZE + 1,) those of them that did not fail."""
+        self.place = torch.zeros(worlds, dtype=torch.long, device=device)
+        """(N,) the row that a world's episode began from, where it did."""
+        self.begun = torch.zeros(worlds, dtype=torch.long, device=device)
+        """(N,) and its number then."""
 
-    def watch(self, failed: Tensor, moment: Memory, generator: torch.Generator) -> None:
-        """After every step: ``failed`` (N,) bool, and what is now, before anything is reset."""
+    def watch(
+        self, ended: Tensor, failed: Tensor, moment: Memory, generator: torch.Generator
+    ) -> None:
+        """After every step: which episodes ``ended`` and which of them ``failed``, (N,) bool, and
+        what is now, before anything is reset."""
         self.step += 1
         self.since += 1
         slots, (now, ago) = len(self.past), divmod(self.step, EVERY)
@@ -92,29 +111,45 @@ class Failures:
         back = max(first, 0) + (draw * (last - max(first, 0) + 1)).long()
         found = failed & (self.since > self.last)
         rows = self.past[(now - back) % slots, torch.arange(len(failed), device=failed.device)]
-        at = (self.count + found.cumsum(0) - 1) % SIZE
-        self.bank.index_copy_(0, at.masked_fill(~found, SIZE), rows)
+        tried = self.retried & ended & (self.number[self.place] == self.begun)
+        self.tries.index_add_(0, self.place, tried.float())
+        self.saves.index_add_(0, self.place, (tried & ~failed).float())
+        number = self.count + found.cumsum(0)
+        at = ((number - 1) % SIZE).masked_fill(~found, SIZE)
+        self.bank.index_copy_(0, at, rows)
+        self.number.index_copy_(0, at, number)
+        self.tries.index_fill_(0, at, 0.0)
+        self.saves.index_fill_(0, at, 0.0)
         self.count += found.sum()
 
     def draw(self, mask: Tensor, generator: torch.Generator) -> tuple[Tensor, Memory]:
         """For the worlds of a ``mask`` (N,) that begin anew: (N,) bool, which do so before a
         failure, and (N, ...) the moments by name, of all worlds."""
         draw = torch.rand(2, len(mask), device=mask.device, generator=generator)
-        kept = self.count.clamp(max=SIZE)
-        again = mask & (draw[0] < self.how.share) & (kept > 0)
+        again = mask & (draw[0] < self.how.share) & (self.count > 0)
+        below = self._weights().cumsum(0)
+        place = torch.searchsorted(below, draw[1] * below[-1], right=True)
+        place = torch.minimum(place, self.count.clamp(1, SIZE) - 1)
+        self.place = torch.where(mask, place, self.place)
+        self.begun = torch.where(mask, self.number[place], self.begun)
         self.retried = torch.where(mask, again, self.retried)
         self.since = self.since.masked_fill(mask, 0)
-        return again, self._unpack(self.bank[(draw[1] * kept).long()])
+        return again, self._unpack(self.bank[place])
+
+    def _weights(self) -> Tensor:
+        """(SIZE,) how often each row is drawn. Of its chance p to be saved the mean over what is
+        possible after its tries, if all were alike before them: (saves + 1) / (tries + 2)."""
+        rows = torch.arange(SIZE, device=self.count.device)
+        there = rows < self.count
+        if self.how.even:
+            return there.float()
+        p = (self.saves[:SIZE] + 1.0) / (self.tries[:SIZE] + 2.0)
+        return p * (1.0 - p) * there
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that decides how it goes on."""
-        return {
-            "past": self.past.clone(),
-            "step": torch.tensor(self.step),
-            "since": self.since.clone(),
-            "retried": self.retried.clone(),
-            "bank": self.bank.clone(),
-            "count": self.count.clone(),
+        return {name: getattr(self, name).clone() for name in _KEPT} | {
+            "step": torch.tensor(self.step)
         }
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -122,7 +157,7 @@ class Failures:
         if "past" not in state or state["past"].shape != self.past.shape:
             raise ValueError("the failures are of another task or number of worlds")
         self.step = int(state["step"])
-        for name in ("past", "since", "retried", "bank", "count"):
+        for name in _KEPT:
             setattr(self, name, state[name].to(self.past.device).clone())
 
     def _pack(self, moment: Memory) -> Tensor:

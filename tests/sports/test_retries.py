@@ -29,7 +29,7 @@ def test_a_moment_lies_as_long_before_the_failure_as_asked(fails_at):
     nobody = torch.zeros(worlds, dtype=torch.bool)
     for step in range(1, fails_at + 1):
         failed = nobody if step < fails_at else torch.arange(worlds) < 150
-        failures.watch(failed, moments(worlds, step), generator)
+        failures.watch(failed, failed, moments(worlds, step), generator)
     assert failures.count == 150
     again, past = failures.draw(~nobody, generator)
     assert 180 < again.sum() <= worlds
@@ -50,7 +50,7 @@ def test_what_fails_soon_after_it_began_is_no_lesson_and_new_failures_replace_ol
     steps = [10, 25, 45]  # since the last reset: 10, 15, 20
     for step in range(1, 46):
         failed = everyone if step in steps else ~everyone
-        failures.watch(failed, moments(worlds, step), generator)
+        failures.watch(failed, failed, moments(worlds, step), generator)
         if step in steps:
             failures.draw(everyone, generator)
     assert failures.count == 2 * worlds
@@ -59,6 +59,40 @@ def test_what_fails_soon_after_it_began_is_no_lesson_and_new_failures_replace_ol
     # The last 700 are all of the last failure, and 324 places hold some of the one before.
     assert (after > 25).sum() == worlds and ((after >= 15) & (after < 25)).sum() == SIZE - worlds
     assert (past["clock"] < 45).all()
+
+
+@pytest.mark.parametrize("even", [False, True])
+def test_moments_that_are_saved_now_and_then_come_most(even):
+    """Three moments: nobody is saved from the first, everybody from the third, half from the
+    second. What an episode does after its moment was replaced says nothing of the new one."""
+    worlds, generator = 300, torch.Generator().manual_seed(0)
+    failures = Failures(Retries(0.99, (0.0, 1.0), even=even), moments(worlds, 0), TENTH)
+    everyone, nobody = torch.ones(worlds, dtype=torch.bool), torch.zeros(worlds, dtype=torch.bool)
+    for step in range(1, 22):
+        failed = torch.arange(worlds) < (3 if step == 21 else 0)
+        failures.watch(failed, failed, moments(worlds, step), generator)
+    assert failures.count == 3
+    came = torch.zeros(3)
+    for step in range(40):
+        again, _ = failures.draw(everyone, generator)
+        place = failures.place
+        came += (torch.bincount(place, minlength=3) if step >= 20 else torch.zeros(3)).float()
+        fails = (place == 0) | ((place == 1) & (torch.arange(worlds) % 2 == 0))
+        failures.watch(everyone, fails & again, moments(worlds, 22), generator)
+    share = came / came.sum()
+    if even:
+        assert ((share - 1 / 3).abs() < 0.03).all()
+    else:
+        assert share[1] > 0.95 and (share > 0).all()
+    p = (failures.saves / failures.tries)[:3]
+    assert p[0] == 0 and p[2] == 1 and 0.4 < p[1] < 0.6
+
+    failures.draw(everyone, generator)
+    tries = failures.tries.clone()
+    failures.number[1] += SIZE  # replaced meanwhile
+    failures.watch(everyone, nobody, moments(worlds, 22), generator)
+    grown = (failures.tries - tries)[:3]
+    assert grown[1] == 0 and grown[[0, 2]].sum() == ((failures.place != 1) & failures.retried).sum()
 
 
 def test_times_that_hold_no_moment_are_refused():
