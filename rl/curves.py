@@ -10,10 +10,13 @@ import csv
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from rl import provenance
+from rl.config import TrainConfig, task_options
 from rl.runlog import KINDS
 from warmstart.atomic import write_json
 
@@ -35,7 +38,8 @@ def record_curve(
     Args:
         progress: ``progress.csv`` of a run.
         card: of the policy it ended with; its origin is copied.
-        out: JSON file, written atomically, on one line: the origin, and ``rows``, a list of numbers
+        out: JSON file, written atomically, on one line: the origin, of its settings those that are
+            not ``train``'s usual ones as of ``usual_of``, a commit; and ``rows``, a list of numbers
             (null where there was none) for each column: samples, minutes, mean return and length of
             episodes, speed, broken worlds, and every metric and curriculum; of a policy that was
             polished what ``olympics-opt polish`` wrote, with the origin of that search.
@@ -52,11 +56,36 @@ def record_curve(
     names = [k for k in rows[0] if k in KEPT or k.startswith(GROUPS)]
     columns = {name: [_number(rows[i][name]) for i in picked] for name in names}
     origin = {name: card[name] for name in ORIGIN if name in card}
+    if "config" in origin:
+        origin["config"] = differing(origin["config"], usual_settings(card["task"]))
+        origin["usual_of"] = provenance.commit()
     if "middle" in rows[0] and "polish" in card:
         search = dict(card["polish"])
         origin |= {name: search.pop(name) for name in ("commit", "hardware")} | {"config": search}
     curve = {"format": "olympics-opt curve 1", **origin, "rows": columns}
     return write_json(out, curve, indent=None)
+
+
+def usual_settings(task: str) -> dict[str, Any]:
+    """What ``train TASK`` is told by default, as JSON has it."""
+    plain = TrainConfig(options=asdict(task_options(task)()))
+    return json.loads(json.dumps(asdict(plain), default=str))
+
+
+def differing(settings: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that are not the usual ones, in groups likewise; empty groups are left out."""
+    told: dict[str, Any] = {}
+    for name, value in settings.items():
+        common = usual.get(name, _NOTHING)
+        if isinstance(value, Mapping) and isinstance(common, Mapping):
+            if some := differing(value, common):
+                told[name] = some
+        elif value != common:
+            told[name] = value
+    return told
+
+
+_NOTHING = object()
 
 
 def _number(text: str | None) -> float | None:

@@ -167,4 +167,4 @@ class Failures:
     def _unpack(self, rows: Tensor) -> Memory:
         sizes = [shape.numel() for shape, _ in self._layout.values()]
         parts = zip(self._layout.items(), rows.split(sizes, -1))
-        return {k: part.reshape(-1, *shape).to(dtype) for (k, (shape, dtype)), part in parts}
+        return {k: part.reshape(len(rows), *shape).to(dtype) for (k, (shape, dtype)), part in parts}

@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
-from rl.curves import main, record_curve
+from rl import provenance
+from rl.config import config_from_dict, parse_args
+from rl.curves import main, record_curve, usual_settings
 
 CARD = {"task": "golf", "commit": "abc", "hardware": "a lathe", "config": {"seed": 3}, "obs": [1]}
 
@@ -49,6 +52,23 @@ def test_numbers_that_are_not_whole_are_rounded(tmp_path):
         "return": [1235000.0],
         "metrics/success": [0.6667],
     }
+
+
+def test_of_the_settings_those_are_kept_that_are_not_the_usual_ones(tmp_path):
+    """What is left out comes back: the usual settings with those that were kept are the card's."""
+    words = ["golf", "--seed", "3", "--ppo.sigma", "0.1", "--task.reach", "20", "--vary"]
+    words += ["--variation.friction", "0.8", "1.2", "--retries.share", "0.5", "--clips", "a", "b"]
+    config = parse_args(words)
+    card = CARD | {"config": json.loads(json.dumps(asdict(config), default=str))}
+    curve = json.loads(record_curve(progress(tmp_path, 2), card, tmp_path / "c.json").read_text())
+    kept = curve["config"]
+    assert curve["usual_of"] == provenance.commit()
+    assert kept["ppo"] == {"sigma": 0.1} and kept["variation"] == {"friction": [0.8, 1.2]}
+    assert set(kept) == {"task", "seed", "ppo", "options", "vary", "variation", "retries", "clips"}
+    whole = usual_settings("golf")
+    for name, value in kept.items():
+        whole[name] = {**whole[name], **value} if isinstance(value, dict) else value
+    assert config_from_dict(whole) == config
 
 
 def test_the_command_takes_a_policy_with_its_curve(tmp_path, capsys):

@@ -28,6 +28,7 @@ from rl.train import TrainConfig, main, parse_args, train
 from rl.worlds import engine_options
 from sports.env import make_env
 from sports.physics.variation import Variation, draw
+from sports.retries import Retries
 from tests.rl.toy import SMALL, Integrator, toy_config, toy_env
 
 ROOT = Path(__file__).parents[2]
@@ -53,12 +54,16 @@ def same_bits(a: Path, b: Path) -> None:
     assert rows(a) == rows(b)
 
 
-@pytest.mark.parametrize("task", ["high_jump", "long_jump"])
-def test_a_resumed_run_repeats_the_uninterrupted_one_bit_for_bit(tmp_path, task):
+@pytest.mark.parametrize(("task", "retries"), [("high_jump", 0.0), ("long_jump", 0.8)])
+def test_a_resumed_run_repeats_the_uninterrupted_one_bit_for_bit(tmp_path, task, retries):
     small = PPOConfig(hidden=(16, 16), steps=12, minibatches=2, epochs=2, sigma_final=0.06)
     each = 12 * 12
     base = TrainConfig(task=task, worlds=12, samples=4 * each, seed=3, quiet=True, ppo=small)
+    if retries:
+        base = dataclasses.replace(base, retries=Retries(retries, (0.1, 0.45)))
     train(dataclasses.replace(base, out=tmp_path / "whole"))
+    if retries:
+        assert last(tmp_path / "whole")["env/failures/retried"].any()
 
     class Interrupted(Exception):
         pass
@@ -237,6 +242,13 @@ def test_command_line():
     assert config.variation == Variation(friction=(0.8, 1.2), own_share=0.3)
     stored = json.loads(json.dumps(dataclasses.asdict(config), default=str))
     assert config_from_dict(stored).variation == config.variation
+    words = ["--retries.share", "0.8", "--retries.seconds", "1", "4", "--retries.even"]
+    config = parse_args(["long_jump", *words])
+    assert config.retries == Retries(0.8, (1.0, 4.0), even=True)
+    stored = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    assert config_from_dict(stored).retries == config.retries
+    del stored["retries"]  # of an older version
+    assert config_from_dict(stored).retries == Retries()
     config = parse_args(["long_jump", "--ppo.sigma", "0.1", "--strength", "human"])
     assert (config.ppo.sigma, config.strength) == (0.1, "human")
 
@@ -367,3 +379,11 @@ def test_like_drake_is_short_for_worlds_with_feet_that_stick():
 def test_worlds_that_cannot_be_are_refused(given, words):
     with pytest.raises(ValueError, match=words):
         TrainConfig("long_jump", **given)
+
+
+@pytest.mark.parametrize(
+    "given", [dict(clone=5, clips=(Path("x.npz"),)), dict(algo="selfplay", task="boxing")]
+)
+def test_retries_are_for_one_athlete_who_learns_by_trying(given):
+    with pytest.raises(ValueError, match=r"leave --retries\.share out"):
+        TrainConfig(**{"task": "javelin", "retries": Retries(0.5)} | given)
