@@ -229,6 +229,11 @@ def soak_shared(
         if folder not in (folders or ()):
             there = folder.name.rpartition("_")[2]
             raise ValueError(f"'{keep}' keeps the shares of {there} processes, not of {processes}")
+    about = {"task": task, "engine": engine, "worlds": worlds, "seed": seed}
+    found: dict[int, Soak | None] = {}
+    for i, folder in enumerate(folders or ()):
+        if shares and i not in shares:
+            found[i] = _kept_share(folder, about)
     context = multiprocessing.get_context("spawn")
     taken = context.Array("q", processes)
     with ProcessPoolExecutor(
@@ -253,12 +258,10 @@ def soak_shared(
         while wait(futures.values(), timeout=LOOK_SECONDS).not_done:
             if on_step is not None:
                 on_step(sum(taken[:]) // len(played))
-    found = {i: future.result() for i, future in futures.items()}
-    if shares and folders is not None:
-        about = {"task": task, "engine": engine, "worlds": worlds, "seed": seed}
-        for i, share in found.items():
+    for i, future in futures.items():
+        found[i] = share = future.result()
+        if shares and folders is not None:
             write_json(folders[i] / _SHARE, {"of": about, "soak": asdict(share)})
-        found |= {i: _kept_share(folders[i], about) for i in range(processes) if i not in found}
     there = [each for i in range(processes) if (each := found[i]) is not None]
     return together(there) if len(there) == processes else None
 

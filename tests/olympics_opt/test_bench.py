@@ -257,26 +257,30 @@ def test_an_endurance_run_shared_out_is_the_sum_of_its_shares(
 def test_shares_played_one_after_another_are_those_played_together(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    common = {"worlds": 5, "processes": 2, "steps": 60, "seed": 3}
-    together = soak_shared("long_jump", "mujoco", **common)
+    apart = [
+        soak("long_jump", "mujoco", worlds=3, steps=40, seed=3),
+        soak("long_jump", "mujoco", worlds=2, steps=40, seed=4),
+    ]
     keep, out = tmp_path / "worlds", tmp_path / "soak.json"
     words = ["--soak", "--task", "long_jump", "--engine", "mujoco", "--worlds", "5", "--steps"]
-    words += ["60", "--seed", "3", "--processes", "2", "--out", str(out), "--keep", str(keep)]
+    words += ["40", "--seed", "3", "--processes", "2", "--out", str(out), "--keep", str(keep)]
     assert bench.main([*words, "--shares", "1"]) == 0
     assert not out.exists() and "until all of 0 to 1" in " ".join(capsys.readouterr().out.split())
     assert bench.main([*words, "--shares", "0"]) == 0
     (row,) = json.loads(out.read_text())["soak"]
-    for name in ("worlds", "processes", "steps", "episodes", "largest_observation", "overflows"):
-        assert row[name] == getattr(together, name), name
-    folder = {"keep": keep / "long_jump_mujoco_5"}
-    with pytest.raises(ValueError, match="another endurance run"):
-        soak_shared("long_jump", "mujoco", shares=(0,), **(common | folder | {"seed": 2}))
+    assert (row["worlds"], row["processes"], row["steps"]) == (5, 2, 40)
+    assert row["episodes"] == sum(each.episodes for each in apart) > 0
+    for name in ("largest_observation", "largest_reward"):
+        assert row[name] == max(getattr(each, name) for each in apart), name
+    kept = {"worlds": 5, "seed": 3, "keep": keep / "long_jump_mujoco_5", "shares": (0,)}
     with pytest.raises(ValueError, match="the shares of 2 processes, not of 3"):
-        soak_shared("long_jump", "mujoco", shares=(0,), **(common | folder | {"processes": 3}))
+        soak_shared("long_jump", "mujoco", processes=3, **kept)
+    with pytest.raises(ValueError, match="share_1_of_2' keeps another endurance run"):
+        soak_shared("long_jump", "mujoco", processes=2, **(kept | {"seed": 4}))  # at once
     with pytest.raises(ValueError, match="must be kept"):
-        soak_shared("long_jump", "mujoco", shares=(0,), **common)
+        soak_shared("long_jump", "mujoco", processes=2, **(kept | {"keep": None}))
     with pytest.raises(ValueError, match="are 0 to 1, not"):
-        soak_shared("long_jump", "mujoco", shares=(2,), **(common | folder))
+        soak_shared("long_jump", "mujoco", processes=2, **(kept | {"shares": (2,)}))
 
 
 def test_a_soak_counts_what_goes_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
