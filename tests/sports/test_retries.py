@@ -95,6 +95,28 @@ def test_moments_that_are_saved_now_and_then_come_most(even):
     assert grown[1] == 0 and grown[[0, 2]].sum() == ((failures.place != 1) & failures.retried).sum()
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_nothing_waits_for_a_gpu():
+    worlds, generator = 200, torch.Generator("cuda").manual_seed(0)
+
+    def told(step: int) -> dict[str, torch.Tensor]:
+        return {name: value.cuda() for name, value in moments(worlds, step).items()}
+
+    steps = [told(step) for step in range(61)]
+    failures = Failures(Retries(0.99, (1.5, 4.2)), steps[0], TENTH)
+    everyone = torch.ones(worlds, dtype=torch.bool, device="cuda")
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for step in range(1, 61):
+            over = everyone if step == 60 else ~everyone
+            failures.watch(over, over, steps[step], generator)
+        again, past = failures.draw(everyone, generator)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert again.sum() > 180 and failures.count == worlds
+    assert set((60 - past["clock"]).tolist()) == {20, 30, 40}
+
+
 def test_times_that_hold_no_moment_are_refused():
     for seconds in ((0.5, 1.3), (2.0, 2.5)):
         with pytest.raises(ValueError, match="a moment is kept every 1 s"):
