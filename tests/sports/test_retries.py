@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from sports.env import SAVED, Env, make_env
+from sports.registry import num_agents, task_names
 from sports.retries import EVERY, SIZE, Failures, Retries
 
 TENTH = 0.1
@@ -182,6 +183,32 @@ def test_a_state_that_is_taken_back_goes_on_alike():
         env.load_state_dict(plain.state_dict())
     for each in (env, other, plain):
         each.close()
+
+
+@pytest.mark.parametrize("task", [name for name in task_names() if num_agents(name) == 1])
+def test_an_episode_of_any_sport_goes_on_in_another_world(task, monkeypatch):
+    """As it does where it was, but for the solver's first guess."""
+    env, other = (make_env(task, num_worlds=4, seed=seed) for seed in (1, 2))
+    generator, shape = torch.Generator().manual_seed(0), (4, 1, env.action_size)
+    for _ in range(12):
+        env.step(0.3 * torch.randn(shape, generator=generator))
+    other.retry(Retries(0.5))
+    moment, everyone = env._moment(), torch.ones(4, dtype=torch.bool)
+    there = {name: value.roll(1, 0) for name, value in moment.items()}
+    monkeypatch.setattr(other._failures, "draw", lambda mask, generator: (everyone, there))
+    seen = other.reset()
+    torch.testing.assert_close(seen, env._observe().roll(1, 0), rtol=1e-5, atol=1e-5)
+    for _ in range(3):
+        action = 0.3 * torch.randn(shape, generator=generator)
+        left, right = env.step(action), other.step(action.roll(1, 0))
+        assert torch.equal(right.terminated, left.terminated.roll(1, 0))
+        if left.terminated.any():
+            break
+        for name, value in left.terms.items():
+            torch.testing.assert_close(
+                right.terms[name], value.roll(1, 0), rtol=1e-3, atol=1e-3, msg=name
+            )
+    env.close(), other.close()
 
 
 def test_retries_are_for_one_athlete():
