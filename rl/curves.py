@@ -56,12 +56,12 @@ def record_curve(
     names = [k for k in rows[0] if k in KEPT or k.startswith(GROUPS)]
     columns = {name: [_number(rows[i][name]) for i in picked] for name in names}
     origin = {name: card[name] for name in ORIGIN if name in card}
-    if "config" in origin:
-        origin["config"] = differing(origin["config"], usual_settings(card["task"]))
-        origin["usual_of"] = provenance.commit()
     if "middle" in rows[0] and "polish" in card:
         search = dict(card["polish"])
         origin |= {name: search.pop(name) for name in ("commit", "hardware")} | {"config": search}
+    elif "config" in origin:
+        origin["config"] = differing(origin["config"], usual_settings(card["task"]))
+        origin["usual_of"] = provenance.commit()
     curve = {"format": "olympics-opt curve 1", **origin, "rows": columns}
     return write_json(out, curve, indent=None)
 
