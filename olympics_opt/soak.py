@@ -222,18 +222,14 @@ def soak_shared(
     gpus = torch.cuda.device_count() if engine == "warp" else 0
     if 0 < gpus < len(played):
         raise RuntimeError(f"{len(played)} processes need a GPU each; here are {gpus}")
-    folders = (
-        None if keep is None else [keep / f"share_{i}_of_{processes}" for i in range(processes)]
-    )
+    names = [f"share_{i}_of_{processes}" for i in range(processes)]
+    folders = [] if keep is None else [keep / name for name in names]
     for folder in () if keep is None else keep.glob("share_*"):
-        if folder not in (folders or ()):
+        if folder not in folders:
             there = folder.name.rpartition("_")[2]
             raise ValueError(f"'{keep}' keeps the shares of {there} processes, not of {processes}")
     about = {"task": task, "engine": engine, "worlds": worlds, "seed": seed}
-    found: dict[int, Soak | None] = {}
-    for i, folder in enumerate(folders or ()):
-        if shares and i not in shares:
-            found[i] = _kept_share(folder, about)
+    found = {i: _kept_share(each, about) for i, each in enumerate(folders) if i not in played}
     context = multiprocessing.get_context("spawn")
     taken = context.Array("q", processes)
     with ProcessPoolExecutor(
@@ -250,7 +246,7 @@ def soak_shared(
                 steps=steps,
                 seed=seed + i,
                 physics_options=threads_of_each(engine, len(played)),
-                keep=None if folders is None else folders[i],
+                keep=folders[i] if folders else None,
                 minutes=minutes,
             )
             for gpu, i in enumerate(played)
@@ -260,7 +256,7 @@ def soak_shared(
                 on_step(sum(taken[:]) // len(played))
     for i, future in futures.items():
         found[i] = share = future.result()
-        if shares and folders is not None:
+        if shares:
             write_json(folders[i] / _SHARE, {"of": about, "soak": asdict(share)})
     there = [each for i in range(processes) if (each := found[i]) is not None]
     return together(there) if len(there) == processes else None

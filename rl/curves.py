@@ -76,16 +76,13 @@ def differing(settings: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str
     """The settings that are not the usual ones, in groups likewise; empty groups are left out."""
     told: dict[str, Any] = {}
     for name, value in settings.items():
-        common = usual.get(name, _NOTHING)
+        common = usual.get(name)
         if isinstance(value, Mapping) and isinstance(common, Mapping):
             if some := differing(value, common):
                 told[name] = some
-        elif value != common:
+        elif name not in usual or value != common:
             told[name] = value
     return told
-
-
-_NOTHING = object()
 
 
 def _number(text: str | None) -> float | None:

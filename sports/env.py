@@ -162,7 +162,7 @@ class Env:
         if self.num_agents > 1:
             raise ValueError("one athlete's failure is another's success: retries are for one")
         self._failures = Failures(how, self._moment(), self.view.control_timestep)
-        self._stock, self._stocks = None, False
+        self._stock = None
         self.metric_names = (*self.metric_names, SAVED)
 
     def reset(self) -> Tensor:
@@ -257,10 +257,12 @@ class Env:
         if self.task.promote is not None:
             self.view.curriculum = self.task.promote(self.view, self.memory, step, counted)
 
-        if self._stocks:
-            # On a CPU, asking which worlds ended costs nothing and saves the work.
-            worlds = ended.nonzero()[:, 0]
-            obs = self._restart(ended, worlds, final_obs) if worlds.numel() else final_obs
+        # On a CPU, asking which worlds ended costs nothing and saves the work.
+        worlds = ended.nonzero()[:, 0] if self._stocks else None
+        if worlds is not None and not worlds.numel():
+            obs = final_obs
+        elif worlds is not None and self._failures is None:
+            obs = self._restart(ended, worlds, final_obs)
         else:
             self._reset(ended)
             obs = self._observe()
@@ -278,8 +280,6 @@ class Env:
         )
 
     def _reset(self, mask: Tensor) -> None:
-        if self._failures is not None and self.device.type == "cpu" and not mask.any():
-            return  # not worth a draw for every world
         state, context = self._draw()
         begun, past = self._clock(context), {}
         if self._failures is not None:
@@ -382,16 +382,8 @@ class Env:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that decides the future: physics, clocks, memory, curriculum, generator."""
-        state = {
-            "qpos": self.physics.qpos.clone(),
-            "qvel": self.physics.qvel.clone(),
-            "mocap_pos": self.physics.mocap_pos.clone(),
-            "clock": self.view.clock.clone(),
-            "age": self.age.clone(),
-            "generator": self.generator.get_state(),
-        }
-        if self.physics.scene.has_waves:
-            state["wave_phase"] = self.physics.wave_phase.clone()
+        state = {k: v.clone() for k, v in self._moment().items()}
+        state |= {"age": self.age.clone(), "generator": self.generator.get_state()}
         extra = getattr(self.physics, "extra_state", None)
         if extra is not None:
             state |= {f"physics/{k}": v for k, v in extra().items()}
@@ -399,7 +391,6 @@ class Env:
             state |= {f"stock/{k}": v for k, v in self._stock.state_dict().items()}
         if self._failures is not None:
             state |= {f"failures/{k}": v for k, v in self._failures.state_dict().items()}
-        state |= {f"memory/{k}": v.clone() for k, v in self.memory.items()}
         state |= {f"curriculum/{k}": v.clone() for k, v in self.curriculum.items()}
         return state
 

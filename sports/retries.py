@@ -106,9 +106,9 @@ class Failures:
         if ago == 0:
             self.past[now % slots] = self._pack(moment)
         # The k-th moment before the last one lies ago + EVERY k steps back.
-        first, last = -((ago - self.first) // EVERY), (self.last - ago) // EVERY
+        first, last = max(-((ago - self.first) // EVERY), 0), (self.last - ago) // EVERY
         draw = torch.rand(len(failed), device=failed.device, generator=generator)
-        back = max(first, 0) + (draw * (last - max(first, 0) + 1)).long()
+        back = first + (draw * (last - first + 1)).long()
         found = failed & (self.since > self.last)
         rows = self.past[(now - back) % slots, torch.arange(len(failed), device=failed.device)]
         tried = self.retried & ended & (self.number[self.place] == self.begun)

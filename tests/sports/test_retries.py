@@ -143,7 +143,6 @@ def test_an_athlete_begins_where_another_was_and_its_metrics_are_apart():
     for _ in range(150):
         action = 0.3 * torch.randn(16, 1, env.action_size, generator=generator)
         before = env._failures.retried.clone()
-        env.keep_snapshot = True
         result = env.step(action)
         assert torch.equal(result.metrics[SAVED].isnan(), ~before)
         assert result.metrics["distance"].isnan().equal(before)
