@@ -103,7 +103,10 @@ def test_options_may_show_more_of_the_same_task_but_not_less(tmp_path):
         load_start(sees, plain, "hurdling")
 
 
-@pytest.mark.parametrize(("task", "option"), [("hurdling", "lane_seen"), ("tennis", "ball_path")])
+@pytest.mark.parametrize(
+    ("task", "option"),
+    [("hurdling", "lane_seen"), ("hurdling", "gap_seen"), ("tennis", "ball_path")],
+)
 def test_a_policy_is_played_with_what_it_learned_to_look_at(tmp_path, task, option):
     """Its card tells, not the caller; other options of its training are not taken over."""
     card = {"config": {"options": {option: True, "finish_ends": True, "reach": 3.0}}}

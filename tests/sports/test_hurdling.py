@@ -59,6 +59,29 @@ def test_the_place_in_the_lane_is_seen_where_it_is_asked_for():
     assert env.obs_slices["goal/lane"].stop == env.obs_size
 
 
+def test_the_place_between_two_hurdles_is_seen_where_it_is_asked_for():
+    def gap(x: float) -> torch.Tensor:
+        world = at(x, height=0.9, gap_seen=True)
+        world._apply()
+        return world.env.task.features(world.env.view, world.env.memory)["gap"].flatten()
+
+    def close(x: float, *known: float) -> None:
+        torch.testing.assert_close(gap(x), torch.tensor(known), atol=1e-4, rtol=0)
+
+    for hurdle in HURDLE_X:
+        close(hurdle, *[0.0] * 6, *[1.0] * 6)
+    quarter, half = 9.14 / 4, 9.14 / 2
+    close(HURDLE_X[3] + quarter, 1.0, 0.0, -1.0, 0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0, -1.0)
+    close(HURDLE_X[9] + half, *[0.0] * 6, *[-1.0, 1.0] * 3)
+    # What differs by 0.05 m looks different, and is the same before all hurdles.
+    near, nearer = gap(HURDLE_X[2] - 2.0), gap(HURDLE_X[7] - 1.95)
+    assert 0.03 < (near - nearer)[[0, 6]].norm() < (near - nearer)[[5, 11]].norm() < 0.25
+    torch.testing.assert_close(gap(HURDLE_X[7] - 2.0), near, atol=1e-4, rtol=0)
+    env = make_env("hurdling", num_worlds=1, options={"gap_seen": True, "lane_seen": True})
+    assert env.obs_size - make_env("hurdling", num_worlds=1).obs_size == 15
+    assert env.obs_slices["goal/gap"].stop == env.obs_size
+
+
 def test_a_landing_pays_the_metres_over_the_hurdle():
     places = [4.0, 6.0, 13.0, 13.7, 14.2, 15.2, 16.1, 16.3, 17.0]  # the hurdle is at 13.72
     world = at(places[0], landing=2.5)
