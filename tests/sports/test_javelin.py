@@ -627,6 +627,31 @@ def test_an_episode_that_ends_with_the_release_earns_what_a_whole_one_does():
     env.close()
 
 
+@pytest.mark.parametrize(
+    ("aside", "valid"), [(0.0, True), (3.0, True), (9.0, False), (-9.0, False)]
+)
+def test_a_flight_may_be_paid_only_where_the_throw_will_count(aside, valid):
+    def release(**options) -> tuple[float, bool]:
+        world = Throw(release_ends=1.0, **options)
+        world.javelin(tuple(world.palm().tolist()))
+        world.at(THROW)
+        world.step(touched=20.0)
+        azimuth = math.atan2(aside, 15.0)
+        world.javelin(FAR, elevation=0.6, velocity=(15.0, aside, 9.0), azimuth=azimuth)
+        step = world.step()
+        assert ended(step) and bool(step.metrics["in_sector"][0]) == valid
+        return float(sum(step.terms[k][0, 0] for k in ("goal", "attitude"))), bool(step.success[0])
+
+    paid, counted = release()
+    only, likewise = release(counts=True)
+    assert counted == likewise == valid and paid > 15.0
+    assert only == pytest.approx(paid) if valid else only < 2.0
+    # One who does not ask for the sector is paid wherever it comes down.
+    assert release(counts=True, anywhere=True) == (pytest.approx(paid), True)
+    with pytest.raises(ValueError, match="release_ends"):
+        Throw(counts=True)
+
+
 def test_the_rest_of_a_flight_is_that_of_turning_tops():
     """20 throws against the search's flight, written apart from it, in numpy and finer steps."""
     draw = np.random.default_rng(2)
