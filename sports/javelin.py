@@ -247,6 +247,7 @@ def advance(view: View, memory: Memory) -> Advance:
     mark, aside, nose_first = _landing(*before, view.control_timestep)
     # What the hand still held when it came down was no throw: the release was seen before.
     thrown, done = landed & memory["released"], failed | landed
+    foretold = None
     if view.config.release_ends > 0.0:
         number = torch.arange(len(x), device=x.device)
         over = (number < view.config.release_ends * len(x)) & free & ~memory["released"] & ~failed
@@ -256,6 +257,7 @@ def advance(view: View, memory: Memory) -> Advance:
         mark, aside = torch.where(over, come.x, mark), torch.where(over, come.y, aside)
         nose_first = torch.where(over, come.nose_first, nose_first)
         thrown, done = thrown | over, done | over
+        foretold = over, come
     distance = mark - LINE_X
     thrown = thrown & ~failed & (distance > 0)
     speed = torch.where(memory["released"], memory["release_speed"], length(velocity))
@@ -264,7 +266,8 @@ def advance(view: View, memory: Memory) -> Advance:
     over_arm = (heights >= -LOW_HAND).all(-1)
     in_sector = aside.abs() <= half_sector(distance)
     success = thrown & (over_arm | view.config.sling) & (in_sector | view.config.anywhere)
-    if view.config.release_ends > 0.0:
+    if foretold is not None:
+        over, come = foretold
         unpaid = ~(over & success) if view.config.counts else ~over
         earned = _WEIGHTS[-2] * (come.x - x), _WEIGHTS[-1] * come.attitude
         for name, more in zip(("goal", "attitude"), earned):
