@@ -389,9 +389,8 @@ def features(view: View, memory: Memory) -> dict[str, Tensor]:
         aside, drift = view.root_pos[..., 1], view.root_linvel[..., 1]
         parts["lane"] = torch.stack((aside, drift, view.heading.sin), dim=-1)
     if view.config.gap_seen:
-        waves = torch.arange(1, WAVES + 1, device=marks.device)
-        turns = (view.root_pos[..., :1] - FIRST_X) / GAP * waves
-        phase = 2.0 * torch.pi * turns
+        waves = constant(tuple(range(1, WAVES + 1)), marks.device)
+        phase = 2.0 * torch.pi * ((view.root_pos[..., :1] - FIRST_X) / GAP * waves)
         parts["gap"] = torch.cat((phase.sin(), phase.cos()), dim=-1)
     return parts
 

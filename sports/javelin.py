@@ -126,10 +126,9 @@ class Javelin:
             )
         if not 0.0 <= self.release_ends <= 1.0:
             raise ValueError(f"a share of the worlds is in [0, 1], not {self.release_ends}")
-        if any(self.release_turn) and self.release_ends == 0.0:
-            raise ValueError("release_turn is of a flight that is foretold: give release_ends")
-        if self.counts and self.release_ends == 0.0:
-            raise ValueError("counts is of a flight that is foretold: give release_ends")
+        for name, given in (("release_turn", any(self.release_turn)), ("counts", self.counts)):
+            if given and self.release_ends == 0.0:
+                raise ValueError(f"{name} is of a flight that is foretold: give release_ends")
         if self.let_go < 0.0:
             raise ValueError(f"the reward for letting go must not be negative: {self.let_go}")
 
