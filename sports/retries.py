@@ -30,8 +30,9 @@ class Retries:
     """Share of episodes that begin so, as soon as there are failures; 0 for none. Of samples it is
     less: they are short. For policies that rarely fail, with one athlete in a world."""
     seconds: tuple[float, float] = (0.5, 3.0)
-    """How long before the failure, drawn evenly. An episode that fails sooner than the longest
-    after it began is no lesson: nor is one that fails once more where it did."""
+    """How long before the failure, drawn evenly, and no longer than the episode had lasted. One
+    that itself began so must have lasted for more than the longest: what fails once more where it
+    did is no new lesson."""
     even: bool = False
     """Draw all moments alike. Else those more often that are saved now and then, by the variance
     of that outcome, p (1 - p): from where nobody can be saved, or anybody, little is learned."""
@@ -106,10 +107,11 @@ class Failures:
         if ago == 0:
             self.past[now % slots] = self._pack(moment)
         # The k-th moment before the last one lies ago + EVERY k steps back.
-        first, last = max(-((ago - self.first) // EVERY), 0), (self.last - ago) // EVERY
+        first = max(-((ago - self.first) // EVERY), 0)
+        last = ((self.since - 1).clamp(max=self.last) - ago) // EVERY
+        found = failed & (last >= first) & (~self.retried | (self.since > self.last))
         draw = torch.rand(len(failed), device=failed.device, generator=generator)
         back = first + (draw * (last - first + 1)).long()
-        found = failed & (self.since > self.last)
         rows = self.past[(now - back) % slots, torch.arange(len(failed), device=failed.device)]
         tried = self.retried & ended & (self.number[self.place] == self.begun)
         self.tries.index_add_(0, self.place, tried.float())

@@ -44,22 +44,50 @@ def test_a_moment_lies_as_long_before_the_failure_as_asked(fails_at):
     assert torch.equal(failures.retried, again) and not failures.since.any()
 
 
-def test_what_fails_soon_after_it_began_is_no_lesson_and_new_failures_replace_old_ones():
+def test_who_fails_soon_after_a_retry_is_no_lesson_and_new_failures_replace_old_ones():
     worlds = 700
     failures = Failures(Retries(0.5, (0.0, 1.0)), moments(worlds, 0), TENTH)
     generator, everyone = torch.Generator(), torch.ones(worlds, dtype=torch.bool)
-    steps = [10, 25, 45]  # since the last reset: 10, 15, 20
-    for step in range(1, 46):
+    steps, counts = [11, 21, 41], []  # since the last reset: 11, 10, 20
+    for step in range(1, 42):
         failed = everyone if step in steps else ~everyone
+        began_so = failures.retried.clone()
         failures.watch(failed, failed, moments(worlds, step), generator)
         if step in steps:
+            counts.append(int(failures.count))
+            if step == 21:
+                assert 250 < began_so.sum() < 450
+                # The rest has a moment of its own, begun at 11: that of step 20.
+                assert counts[1] - counts[0] == (~began_so).sum()
+                new = failures.bank[counts[0] : SIZE, 0][: counts[1] - counts[0]]
+                assert (new == 20).all()
             failures.draw(everyone, generator)
-    assert failures.count == 2 * worlds
+    assert counts[0] == worlds and counts[2] == counts[1] + worlds
     _, past = failures.draw(everyone, generator)
     after = failures.bank[:SIZE, 0]
-    # The last 700 are all of the last failure, and 324 places hold some of the one before.
-    assert (after > 25).sum() == worlds and ((after >= 15) & (after < 25)).sum() == SIZE - worlds
-    assert (past["clock"] < 45).all()
+    # The last 700 are all of the last failure, and 324 places hold some of those before.
+    assert (after > 30).sum() == worlds and (after <= 20).sum() == SIZE - worlds
+    assert (past["clock"] < 41).all()
+
+
+@pytest.mark.parametrize("fails_after", range(2, 45))
+def test_of_a_short_episode_moments_are_its_own(fails_after):
+    """Begun at step 37, failed so many steps later, with moments asked from 1.5 to 4.2 s before."""
+    worlds, began = 300, 37
+    failures = Failures(Retries(0.99, (1.5, 4.2)), moments(worlds, 0), TENTH)
+    generator, everyone = torch.Generator(), torch.ones(worlds, dtype=torch.bool)
+    for step in range(1, began + fails_after + 1):
+        over = everyone if step in (began, began + fails_after) else ~everyone
+        failures.watch(over, over & (step > began), moments(worlds, step), generator)
+        if step == began:
+            failures.draw(everyone, generator)
+            assert not failures.retried.any()
+    own = range(began + 1, began + fails_after + 1)
+    kept = {s for s in own if s % EVERY == 0 and 15 <= began + fails_after - s <= 42}
+    assert failures.count == (worlds if kept else 0)
+    if kept:
+        _, past = failures.draw(everyone, generator)
+        assert set(past["clock"].tolist()) == kept
 
 
 @pytest.mark.parametrize("even", [False, True])
