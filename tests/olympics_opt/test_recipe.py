@@ -76,19 +76,22 @@ def test_a_mean_is_told_before_a_polish_or_after_it_as_it_was(first, then, tmp_p
 def test_two_kinds_of_worlds_want_two_processes(capsys):
     text, commands = told(capsys, "hurdling", "--policy", "pretrained:latent-varied")
     assert commands[0][:4] == ["torchrun", "--standalone", "--nproc-per-node", "2"]
-    assert "mean of 3 states" in text and "253,952 episodes" in text
+    assert "mean of 9 states" in text
+    text, commands = told(capsys, "long_jump", "--policy", "pretrained:latent")
+    assert commands[0][:4] == ["torchrun", "--standalone", "--nproc-per-node", "2"]
+    assert "mean of 2 states" in text and "13,056 episodes" in text
 
 
 def test_a_polish_of_several_processes_is_told_as_one(tmp_path, capsys):
     """With a card as ``polish`` writes it under ``torchrun``."""
-    shipped = pretrained.locate("hurdling", "latent-varied")
+    shipped = pretrained.locate("long_jump", "latent")
     policy = Path(shutil.copy(shipped, tmp_path))
     card = pretrained.card(shipped)
     card["polish"]["stages"] = [{"episodes": 96, "worlds": {"engine": "mujoco", "processes": 3}}]
     policy.with_suffix(".json").write_text(json.dumps(card))
-    _, (_, polish) = told(capsys, "hurdling", "--policy", str(policy))
+    _, (_, polish) = told(capsys, "long_jump", "--policy", str(policy))
     assert polish[:6] == "torchrun --standalone --nproc-per-node 3 -m olympics_opt".split()
-    assert polish[6:8] == ["polish", "hurdling"]
+    assert polish[6:8] == ["polish", "long_jump"]
 
 
 def test_the_prior_has_a_recipe_too(capsys):
