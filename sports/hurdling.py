@@ -119,6 +119,11 @@ class Hurdling:
     """Share of a world's h_max below which none of its hurdles are drawn; 0 draws them from the
     ground on, as the paper does. Half of those are no lesson: the same policy that stood still at
     h_max 0.6 m went from 20 to 41 m over hurdles of 0.42 m in 0.4 M samples."""
+    pace: float = 0.0
+    """Metres a second, from a hurdle to the next or to the finish, below which a hurdle that was
+    cleared raises no heights; 0 counts it at any pace. Heights that rise with an athlete that has
+    only just learned to run are learned at a walk: a policy in latents came to 1.167 m at 4.1 m/s,
+    with a squat before and after each, hardly ever fell, and had run 81 m when 20 s were over."""
     landing: float = 0.0
     """Metres behind a hurdle in which progress is paid only at their end; 0 pays every metre, as
     the paper does. Who trips over a hurdle gains two metres as well: whom no hurdle of that height
@@ -182,6 +187,8 @@ class Hurdling:
             low, high, kind = LOWEST_TOPPLING, HIGHEST_TOPPLING, "toppling hurdle"
         if self.lower < 0.0:
             raise ValueError(f"heights fall by 0 m or more, not {self.lower}")
+        if self.pace < 0.0:
+            raise ValueError(f"a pace that counts is 0 m/s or more, not {self.pace}")
         if self.leap < 0.0:
             raise ValueError(f"the reward for leaping must not be negative: {self.leap}")
         if self.lane < 0.0:
@@ -356,6 +363,8 @@ def begin(view: View, context: Memory) -> Memory:
     zero = torch.zeros_like(root[:, 0])
     left = length(root - constant(GOAL, root.device)) + withheld(root[:, 0], view.config.landing)
     shaping = {"rises": zero.clone()} if view.config.leap > 0.0 else {}
+    if view.config.pace > 0.0:
+        shaping["passed_clock"] = zero.clone()
     return {
         **shaping,
         "marks": context["marks"],
@@ -449,6 +458,12 @@ def advance(view: View, memory: Memory) -> Advance:
     # A hurdle is cleared when the next one is reached, or the finish.
     further = passed != memory["passed"]
     cleared = memory["over"].masked_fill(~(further | arrives), 0.0)
+    if view.config.pace > 0.0:
+        began, clock = memory["passed_clock"], view.clock.to(x.dtype)
+        apart = torch.where(arrives, FINISH_X - (FIRST_X + GAP * (HURDLES - 1)), GAP)
+        slow = apart < view.config.pace * (clock - began) * view.control_timestep
+        cleared = cleared.masked_fill(slow, 0.0)
+        shaping["passed_clock"] = torch.where(further, clock, began)
     over = torch.where(further, height[:, 0], memory["over"])
     success = finished.float()
     top_speed = torch.maximum(memory["top_speed"], view.root_linvel[:, 0, 0])

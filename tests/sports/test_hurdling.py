@@ -524,6 +524,38 @@ def test_a_hurdle_is_cleared_when_the_next_one_is_reached():
     assert seen == [(pytest.approx(h), n) for h, n in expected]
 
 
+@pytest.mark.parametrize(
+    ("over", "to", "steps", "counts"),
+    [
+        (0, 23.0, 45, True),  # 9.14 m in 1.5 s: 6.09 m/s
+        (0, 23.0, 46, False),  # 5.96 m/s
+        (9, 110.1, 70, True),  # 14.02 m in 2.33 s: 6.01 m/s
+        (9, 110.1, 71, False),  # 5.92 m/s
+    ],
+)
+def test_a_hurdle_cleared_below_the_pace_raises_nothing(
+    over: int, to: float, steps: int, counts: bool
+):
+    """From one hurdle to the next or to the finish, however long the way to the former took."""
+    world = at(HURDLE_X[over] - 0.3, z=HIGH, height=0.8, pace=6.0)
+    world.env.view.clock += 100
+    world.place((HURDLE_X[over] + 0.1, 0.0, HIGH))
+    world.advance()
+    world.env.view.clock += steps - 2
+    world.place((to - 0.3, 0.0, HIGH))
+    world.advance()
+    world.place((to, 0.0, HIGH))
+    step = world.advance()
+    assert float(world.env.memory["highest"][0]) == (pytest.approx(0.8) if counts else 0.0)
+    assert step.metrics["hurdles"][0] == (1 if over == 9 else 2)
+
+
+def test_a_pace_is_not_negative_and_none_leaves_nothing_to_remember():
+    with pytest.raises(ValueError, match="0 m/s or more"):
+        Hurdling(pace=-0.1)
+    assert "passed_clock" not in HandMade("hurdling").env.memory
+
+
 def test_the_last_hurdle_is_cleared_at_the_finish():
     world = at(95.0, z=HIGH)
     world.env.memory["marks"][:, :10, 2] = 0.8
