@@ -364,7 +364,7 @@ def begin(view: View, context: Memory) -> Memory:
     left = length(root - constant(GOAL, root.device)) + withheld(root[:, 0], view.config.landing)
     shaping = {"rises": zero.clone()} if view.config.leap > 0.0 else {}
     if view.config.pace > 0.0:
-        shaping["passed_clock"] = zero.clone()
+        shaping["passed_clock"] = torch.zeros_like(view.clock)
     return {
         **shaping,
         "marks": context["marks"],
@@ -459,11 +459,10 @@ def advance(view: View, memory: Memory) -> Advance:
     further = passed != memory["passed"]
     cleared = memory["over"].masked_fill(~(further | arrives), 0.0)
     if view.config.pace > 0.0:
-        began, clock = memory["passed_clock"], view.clock.to(x.dtype)
+        seconds = (view.clock - memory["passed_clock"]) * view.control_timestep
         apart = torch.where(arrives, FINISH_X - (FIRST_X + GAP * (HURDLES - 1)), GAP)
-        slow = apart < view.config.pace * (clock - began) * view.control_timestep
-        cleared = cleared.masked_fill(slow, 0.0)
-        shaping["passed_clock"] = torch.where(further, clock, began)
+        cleared = cleared.masked_fill(apart < view.config.pace * seconds, 0.0)
+        shaping["passed_clock"] = torch.where(further, view.clock, memory["passed_clock"])
     over = torch.where(further, height[:, 0], memory["over"])
     success = finished.float()
     top_speed = torch.maximum(memory["top_speed"], view.root_linvel[:, 0, 0])
