@@ -124,6 +124,9 @@ class Hurdling:
     cleared raises no heights; 0 counts it at any pace. Heights that rise with an athlete that has
     only just learned to run are learned at a walk: a policy in latents came to 1.167 m at 4.1 m/s,
     with a squat before and after each, hardly ever fell, and had run 81 m when 20 s were over."""
+    first_max: float = LEAST_MAX
+    """``h_max`` (m) of every world when training begins: what the lesson before this one came to.
+    ``--init`` takes an actor over and no heights."""
     landing: float = 0.0
     """Metres behind a hurdle in which progress is paid only at their end; 0 pays every metre, as
     the paper does. Who trips over a hurdle gains two metres as well: whom no hurdle of that height
@@ -189,6 +192,9 @@ class Hurdling:
             raise ValueError(f"heights fall by 0 m or more, not {self.lower}")
         if self.pace < 0.0:
             raise ValueError(f"a pace that counts is 0 m/s or more, not {self.pace}")
+        if not LEAST_MAX <= self.first_max <= MOST_MAX:
+            text = f"the first h_max must lie in [{LEAST_MAX}, {MOST_MAX}] m, not {self.first_max}"
+            raise ValueError(text)
         if self.leap < 0.0:
             raise ValueError(f"the reward for leaping must not be negative: {self.leap}")
         if self.lane < 0.0:
@@ -280,8 +286,8 @@ def scene(config: Hurdling, body: Body) -> Scene:
 
 def curriculum(config: Hurdling, num_worlds: int, device: torch.device) -> Memory:
     """Each world's ``h_max`` (m): its hurdles are drawn between the ground and that."""
-    low = LEAST_MAX if curriculum_grows(config) else MOST_MAX
-    return {"h_max": torch.full((num_worlds,), low, device=device)}
+    first = config.first_max if curriculum_grows(config) else MOST_MAX
+    return {"h_max": torch.full((num_worlds,), first, device=device)}
 
 
 def curriculum_grows(config: Hurdling) -> bool:

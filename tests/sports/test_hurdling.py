@@ -495,6 +495,21 @@ def test_heights_fall_with_a_race_that_ends_early_where_they_may():
         Hurdling(lower=-0.1)
 
 
+def test_a_lesson_begins_with_the_heights_of_the_one_before():
+    env = HandMade("hurdling", num_worlds=400, first_max=0.9, least=0.8, races=0.0).env
+    assert env.view.curriculum["h_max"].tolist() == pytest.approx([0.9] * 400)
+    state = default_state(env.physics.scene, 400, env.device)
+    generator = torch.Generator().manual_seed(0)
+    _, context = env.task.start(env.view, state, {}, generator, True)
+    tops = context["marks"][:, :10, 2]
+    boards = tops[tops > 0.0]
+    assert 0.72 - 1e-6 <= boards.min() < 0.73 and 0.89 < boards.max() <= 0.9 + 1e-6
+    with pytest.raises(ValueError, match="first h_max"):
+        Hurdling(first_max=0.2)
+    with pytest.raises(ValueError, match="first h_max"):
+        Hurdling(first_max=1.2)
+
+
 def test_no_hurdle_is_lower_than_the_least_share_of_h_max():
     world = HandMade("hurdling", num_worlds=400, least=0.8)
     env = world.env
