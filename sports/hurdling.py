@@ -63,6 +63,8 @@ THROUGH = 0.10
 LEAST_MAX, MOST_MAX, RAISE = 0.3, 1.167, 0.15
 PROOF = 0.8
 """Share of h_max that the highest hurdle cleared must have had to count."""
+SLOW = 4.0
+"""Metres a second from hurdle to hurdle that earn no ``haste``."""
 
 TAKE_OFF = (0.7, 2.5)
 """Metres before a hurdle in which a leap over it begins. Nearer, a thigh that hits the board is
@@ -124,6 +126,12 @@ class Hurdling:
     cleared raises no heights; 0 counts it at any pace. Heights that rise with an athlete that has
     only just learned to run are learned at a walk: a policy in latents came to 1.167 m at 4.1 m/s,
     with a squat before and after each, hardly ever fell, and had run 81 m when 20 s were over."""
+    haste: float = 0.0
+    """Reward for each second by which the way from one hurdle to the next, or to the finish, takes
+    less than at ``SLOW``; 0 for none, as in the paper. Paid for metres alone at a discount of 0.99,
+    who runs safely gains nothing from running faster: a policy in latents that came to the race's
+    boards with a ``pace`` of 5 m/s ran at 4.9 m/s for 160 M samples more, and had run 95 m when
+    20 s were over."""
     first_max: float = LEAST_MAX
     """``h_max`` (m) of every world when training begins: what the lesson before this one came to.
     ``--init`` takes an actor over and no heights."""
@@ -192,6 +200,8 @@ class Hurdling:
             raise ValueError(f"heights fall by 0 m or more, not {self.lower}")
         if self.pace < 0.0:
             raise ValueError(f"a pace that counts is 0 m/s or more, not {self.pace}")
+        if self.haste < 0.0:
+            raise ValueError(f"the reward for haste must not be negative: {self.haste}")
         if not LEAST_MAX <= self.first_max <= MOST_MAX:
             text = f"the first h_max must lie in [{LEAST_MAX}, {MOST_MAX}] m, not {self.first_max}"
             raise ValueError(text)
@@ -369,7 +379,7 @@ def begin(view: View, context: Memory) -> Memory:
     zero = torch.zeros_like(root[:, 0])
     left = length(root - constant(GOAL, root.device)) + withheld(root[:, 0], view.config.landing)
     shaping = {"rises": zero.clone()} if view.config.leap > 0.0 else {}
-    if view.config.pace > 0.0:
+    if view.config.pace > 0.0 or view.config.haste > 0.0:
         shaping["passed_clock"] = torch.zeros_like(view.clock)
     return {
         **shaping,
@@ -464,10 +474,14 @@ def advance(view: View, memory: Memory) -> Advance:
     # A hurdle is cleared when the next one is reached, or the finish.
     further = passed != memory["passed"]
     cleared = memory["over"].masked_fill(~(further | arrives), 0.0)
-    if view.config.pace > 0.0:
+    if view.config.pace > 0.0 or view.config.haste > 0.0:
         seconds = (view.clock - memory["passed_clock"]) * view.control_timestep
         apart = torch.where(arrives, FINISH_X - (FIRST_X + GAP * (HURDLES - 1)), GAP)
         cleared = cleared.masked_fill(apart < view.config.pace * seconds, 0.0)
+        if view.config.haste > 0.0:
+            # The way to its first hurdle begins standing.
+            ran = (further | arrives) & (memory["passed"] > memory["given"]) & ~failed
+            terms["haste"] = view.config.haste * (apart / SLOW - seconds).clamp(min=0.0) * ran
         shaping["passed_clock"] = torch.where(further, view.clock, memory["passed_clock"])
     over = torch.where(further, height[:, 0], memory["over"])
     success = finished.float()

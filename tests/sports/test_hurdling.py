@@ -565,6 +565,42 @@ def test_a_hurdle_cleared_below_the_pace_raises_nothing(
     assert step.metrics["hurdles"][0] == (1 if over == 9 else 2)
 
 
+@pytest.mark.parametrize(("over", "to"), [(0, 23.0), (9, 110.1)])
+@pytest.mark.parametrize("steps", [30, 45, 120])
+def test_haste_pays_for_each_second_less_than_at_four_metres_a_second(
+    over: int, to: float, steps: int
+):
+    """9.14 m in 2.285 s and 14.02 m in 3.505 s earn nothing, and neither does the way to the first
+    hurdle, whose start was standing."""
+    world = at(HURDLE_X[over] - 0.3, z=HIGH, height=0.8, haste=20.0)
+    world.env.view.clock += 10
+    world.place((HURDLE_X[over] + 0.1, 0.0, HIGH))
+    assert float(world.advance().terms["haste"]) == 0.0
+    world.env.view.clock += steps - 2
+    world.place((to - 0.3, 0.0, HIGH))
+    assert float(world.advance().terms["haste"]) == 0.0
+    world.place((to, 0.0, HIGH))
+    way = 9.14 if over == 0 else 14.02
+    earned = 20.0 * max(way / 4.0 - steps / 30.0, 0.0)
+    assert float(world.advance().terms["haste"]) == pytest.approx(earned, abs=1e-3)
+    world.place((to + 0.2, 0.0, HIGH))
+    assert float(world.advance().terms["haste"]) == 0.0
+
+
+def test_haste_pays_nobody_who_meets_the_hurdle():
+    world = at(HURDLE_X[0] - 0.3, z=HIGH, height=0.8, haste=20.0)
+    world.place((HURDLE_X[0] + 0.1, 0.0, HIGH))
+    world.advance()
+    world.place((HURDLE_X[1] - 0.1, 0.0, 0.5))
+    world.advance()
+    world.place((HURDLE_X[1] + 0.1, 0.0, 0.5))
+    step = world.advance()
+    assert bool(step.terminated[0, 0])
+    assert float(step.terms["haste"]) == 0.0
+    with pytest.raises(ValueError, match="haste must not be negative"):
+        Hurdling(haste=-1.0)
+
+
 def test_a_pace_is_not_negative_and_none_leaves_nothing_to_remember():
     with pytest.raises(ValueError, match="0 m/s or more"):
         Hurdling(pace=-0.1)
