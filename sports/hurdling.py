@@ -305,6 +305,11 @@ def curriculum_grows(config: Hurdling) -> bool:
     return config.curriculum and config.height is None and not config.toppling
 
 
+def times_hurdles(config: Hurdling) -> bool:
+    """Whether how long an athlete takes from hurdle to hurdle is of use."""
+    return config.pace > 0.0 or config.haste > 0.0
+
+
 def promote(view: View, memory: Memory, step: Advance, ended: Tensor) -> Memory:
     """Higher hurdles for a world whose athlete cleared one near its height and ran on to the next
     hurdle or the finish, from wherever it started standing: a demonstration is no proof. Asked for
@@ -379,7 +384,7 @@ def begin(view: View, context: Memory) -> Memory:
     zero = torch.zeros_like(root[:, 0])
     left = length(root - constant(GOAL, root.device)) + withheld(root[:, 0], view.config.landing)
     shaping = {"rises": zero.clone()} if view.config.leap > 0.0 else {}
-    if view.config.pace > 0.0 or view.config.haste > 0.0:
+    if times_hurdles(view.config):
         shaping["passed_clock"] = torch.zeros_like(view.clock)
     return {
         **shaping,
@@ -474,7 +479,7 @@ def advance(view: View, memory: Memory) -> Advance:
     # A hurdle is cleared when the next one is reached, or the finish.
     further = passed != memory["passed"]
     cleared = memory["over"].masked_fill(~(further | arrives), 0.0)
-    if view.config.pace > 0.0 or view.config.haste > 0.0:
+    if times_hurdles(view.config):
         seconds = (view.clock - memory["passed_clock"]) * view.control_timestep
         apart = torch.where(arrives, FINISH_X - (FIRST_X + GAP * (HURDLES - 1)), GAP)
         cleared = cleared.masked_fill(apart < view.config.pace * seconds, 0.0)
