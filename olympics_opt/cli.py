@@ -413,6 +413,11 @@ COMMANDS: dict[str, Command] = {
     "train": Command(
         None, "olympics_opt.play:run_train", summary="Train a policy, on the CPU or on GPUs."
     ),
+    "lessons": Command(
+        None,
+        "olympics_opt.lessons:run_lessons",
+        summary="Train a policy in several lessons, one after another, from one file.",
+    ),
     "polish": Command(Polish, "olympics_opt.polish:run_polish", "task"),
     "export": Command(Export, "olympics_opt.play:run_export"),
     "recipe": Command(Recipe, "olympics_opt.recipe:run_recipe"),

@@ -6,8 +6,9 @@ same first weights.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -23,6 +24,7 @@ from rl.config import (
     TrainConfig,
     load_placed_starts,
     load_starts,
+    task_options,
 )
 from rl.host import RANK_STEP, local_ranks, pick_device, threads_of_each
 from rl.meter import EpisodeMeter
@@ -34,6 +36,7 @@ from rl.rollout import Actor, Rollout
 from rl.warm_start import load_start
 from rl.worlds import engine_options, in_own_worlds
 from sports.env import Env, Starts, make_env
+from sports.registry import task_names
 
 MakeEnv = Callable[[TrainConfig, int], Any]
 """(config, seed) -> environment."""
@@ -258,6 +261,22 @@ def _begin_from(
     assert policy.actor is not None
     count = policy.metadata["obs_count"]
     agent.load_policy(policy.actor, policy.mean, policy.std, count, seen=~unseen)
-    critic = agent.load_critic(policy.extra)
-    warmup = 0 if critic else config.hyper.critic_warmup
+    knows = agent.load_critic(policy.extra) and _pays_alike(policy.metadata, config)
+    warmup = 0 if knows else config.hyper.critic_warmup
     return warmup, unseen.to(agent.device) if bool(unseen.any()) else None
+
+
+def _pays_alike(card: dict[str, Any], config: TrainConfig) -> bool:
+    """Whether a critic that came with a policy knows what is paid now: the same discount, rewards
+    and options of the same task."""
+    then = card.get("config") or {}
+    plain = asdict(task_options(config.task)()) if config.task in (*task_names(), *APART) else {}
+    own = json.loads(json.dumps(asdict(config), default=str))
+    plain = json.loads(json.dumps(plain, default=str))
+
+    def paid(told: dict[str, Any], gamma: float) -> tuple[Any, ...]:
+        rest = (told.get(name) for name in ("task", "algo", "imitation", "impact"))
+        return gamma, plain | (told.get("options") or {}), *rest
+
+    gamma = then.get("ppo", {}).get("gamma")
+    return paid(then, gamma) == paid(own, config.hyper.gamma)

@@ -16,6 +16,7 @@ from rl.latent_action import LatentConfig
 from rl.ppo import PAPER, PPOConfig
 from rl.selfplay import SelfPlayConfig
 from rl.steady import BALANCE
+from rl.until import Until
 from rl.worlds import are_own
 from rl.worlds import mistakes as world_mistakes
 from sports.env import Starts
@@ -57,6 +58,10 @@ class TrainConfig:
     given."""
     minutes: float | None = None
     """Stop after this many minutes of training, earlier sessions of the run counted in."""
+    until: str | None = None
+    """Stop as soon as a figure of progress.csv, as the mean of its last 12 values, has come to a
+    level: ``"metrics/success>=0.9"``, ``"curriculum/h_max>=0.55"``; ``samples`` and ``minutes``
+    bound it all the same, and schedules go by them."""
     seed: int = 0
     """Seed of weights, noise and environment."""
     resume: bool = False
@@ -211,6 +216,11 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
         value = getattr(c, name)
         if value is not None and value <= 0:
             yield f"{name} must be positive, not {value}"
+    if c.until is not None:
+        try:
+            Until(c.until)
+        except ValueError as error:
+            yield str(error)
     if c.impact < 0.0 or c.impact_limit < 0.0:
         yield "impact and impact_limit must not be negative"
     if not all(0.0 <= p <= 1.0 for p in c.start_probability):

@@ -91,7 +91,8 @@ class PPOConfig:
     policy, or was cloned. They move the actor: with a third of new samples and no learning at all a
     thrower of 28 m throws 15 m and a hurdler that always finishes never does."""
     critic_warmup: int = 5
-    """Iterations in which only the critic learns, after a start from a policy without one."""
+    """Iterations in which only the critic learns, after a start from a policy without one, or with
+    one that learned at another discount, with other rewards or with other options of the task."""
     anchor: float = 0.0
     """Cost of each nat by which an actor that began as another policy diverges from that one,
     beside advantages of unit deviation: where they say little it stays what it was, where they say

@@ -24,7 +24,7 @@ from rl.policy import KEPT, export_policy, learned
 from sports.registry import task_names
 from warmstart.atomic import write_text
 
-FREE = {"out", "resume", "samples", "minutes", "quiet", "checkpoint_minutes"}
+FREE = {"out", "resume", "samples", "minutes", "until", "quiet", "checkpoint_minutes"}
 FREE |= {"checkpoint_iterations", "keep_policies", "device", "cuda_graph", "physics_options"}
 FREE |= {"profile"}
 """What a resumed run may change; everything else is the run's own."""
@@ -74,7 +74,7 @@ def settle(config: TrainConfig) -> TrainConfig:
         if f.name == "options":
             _same_options(config.task, given, own)
         elif f.name in FREE:
-            kept = f.name in ("samples", "minutes") and not asked
+            kept = f.name in ("samples", "minutes", "until") and not asked
             changes[f.name] = own if kept else given
         elif asked and given != own:
             raise ValueError(

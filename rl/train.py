@@ -30,6 +30,7 @@ from rl.rate_watch import RateWatch
 from rl.rollout import collect
 from rl.run_folder import Progress, keep_policy, restore, save, settle, write_config
 from rl.runlog import KINDS, Row, RunLog
+from rl.until import Until
 from sports.env import Starts
 
 __all__ = ["RunSummary", "TrainConfig", "load_starts", "main", "parse_args", "train"]
@@ -44,7 +45,7 @@ class RunSummary:
     samples: int
     minutes: float
     stopped_by: str
-    """``samples``, ``minutes``, ``signal``, or ``profile``."""
+    """``samples``, ``minutes``, ``until``, ``signal``, or ``profile``."""
     metrics: dict[str, float]
     """Episode metrics of the last iteration in which an episode ended."""
     checkpoint: Path
@@ -69,7 +70,7 @@ def train(
     on_iteration: Callable[[Row], None] | None = None,
     part: float = 1.0,
 ) -> RunSummary:
-    """Trains until ``samples``, ``minutes`` or a signal, whichever is first.
+    """Trains until ``samples``, ``minutes``, what ``until`` says or a signal, whichever is first.
 
     Args:
         config: see TrainConfig.
@@ -102,6 +103,9 @@ class _Trainer:
             self.now = Progress(obs=self.env.reset(), warmup=made.warmup)
         self.goal = self.config.samples
         """Samples at which the run is done, as far as they decide."""
+        self.until = None if self.config.until is None else Until(self.config.until)
+        self.there = False
+        """Whether what ``until`` asks for has come."""
         self.began = 0.0
         """When the run began by this process's clock, had it never paused (s)."""
 
@@ -120,6 +124,7 @@ class _Trainer:
             with Signals() as signals:
                 while not (stopped_by := self._stopped_by(part, signals)):
                     row = self._iterate()
+                    self.there = self.until is not None and self.until(row)
                     if self.rank == 0:
                         if log is None:
                             after = self.now.iteration - 1
@@ -172,6 +177,8 @@ class _Trainer:
     def _stopped_by(self, part: float, signals: Signals) -> str:
         """Which criterion ends this part of the run now, or nothing."""
         minutes = self.config.minutes
+        if self.there:
+            return "until"
         if self.goal is not None and self.now.samples >= part * self.goal:
             return "samples"
         if minutes is not None and self.now.minutes >= part * minutes:

@@ -210,6 +210,28 @@ def test_fine_tuning_starts_from_the_policy(tmp_path):
         train(TrainConfig(task="long_jump", out=tmp_path / "c", init=str(tmp_path / "a")))
 
 
+@pytest.mark.parametrize(
+    ("changes", "rests"),
+    [
+        ({}, False),
+        ({"ppo": dataclasses.replace(SMALL, critic_warmup=3, gamma=0.9)}, True),
+        ({"ppo": dataclasses.replace(SMALL, critic_warmup=3, sigma=0.2)}, False),
+        ({"ppo": dataclasses.replace(SMALL, critic_warmup=0, gamma=0.9)}, False),
+        ({"options": {"bar": 1.0}}, True),
+        ({"seed": 5, "worlds": 32}, False),
+    ],
+)
+def test_a_critic_learns_alone_first_where_something_else_is_paid(tmp_path, changes, rests):
+    """A run that goes on from another: the actor stays what it was for two iterations, or not."""
+    train(toy_config(tmp_path / "a", samples=2 * 1024), environment=toy_env)
+    short = {"samples": 2 * 16 * changes.get("worlds", 64), "init": str(tmp_path / "a")}
+    train(toy_config(tmp_path / "b", **short, **changes), environment=toy_env)
+    before, after = (last(tmp_path / name) for name in "ab")
+    for name in (name for name in before if name.startswith(("agent/actor.", "agent/critic."))):
+        same = torch.equal(before[name], after[name])
+        assert same == (rests and name.startswith("agent/actor.")), name
+
+
 @pytest.mark.parametrize("moving", [False, True])
 def test_an_actor_that_does_not_learn_stays_the_policy_it_began_as(tmp_path, moving):
     """With rate 0 in a world 3 m away, where observations are others: what it does is what the

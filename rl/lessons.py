@@ -1,0 +1,267 @@
+"""A policy that learns in several lessons, one run after another, from one file.
+
+What a run cannot change while it learns - its discount, what is paid, how long a rollout is - may
+differ from lesson to lesson. A plan is a TOML file: the ``task``, ``options`` of ``train`` that
+hold in all lessons, and ``[[lessons]]`` with a ``name`` and the ``options`` of each. Every lesson
+begins with the policy that the one before came to, its critic too. ``{curriculum/h_max}`` in its
+options is what that column of progress.csv had come to there (the mean of its last values), and
+``{project}`` the folder of this project. Plans of ours are in ``rl/plans``.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rl.config import APART, TrainConfig, parse_args
+from rl.policy import export_policy, read_policy
+from rl.recipe import train_words
+from rl.runlog import read_progress
+from rl.train import train
+from rl.until import GROUPS, ITERATIONS
+from sports.registry import task_names
+from warmstart import atomic
+
+PLANS = Path(__file__).with_name("plans")
+PROJECT = Path(__file__).resolve().parents[1]
+OURS = ("--out", "--resume", "--no-resume")
+"""Options that lessons set themselves."""
+RECORD = "lessons.json"
+POLICY = "policy.safetensors"
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """One run of several."""
+
+    name: str
+    options: tuple[str, ...]
+    """Of ``train``; ``{NAME}`` stands for what is known when it begins."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is learned, and in which order."""
+
+    task: str
+    about: str
+    """In words, for people."""
+    options: tuple[str, ...]
+    """Of all lessons."""
+    lessons: tuple[Lesson, ...]
+
+
+@dataclass(frozen=True)
+class Ended:
+    """What a lesson came to."""
+
+    name: str
+    samples: int
+    minutes: float
+    stopped_by: str
+    """As in ``rl.train.RunSummary``."""
+    levels: dict[str, float]
+    """Mean of the last values of the columns of ``rl.until.GROUPS``."""
+
+    def sentence(self) -> str:
+        """For the screen."""
+        return (
+            f"{self.name}: {self.samples:,} samples, {self.minutes:.1f} minutes, stopped by "
+            f"{self.stopped_by}"
+        )
+
+
+# -- plans --------------------------------------------------------------------------------------
+
+
+def plan_names() -> list[str]:
+    """Plans that the project brings."""
+    return sorted(path.stem for path in PLANS.glob("*.toml"))
+
+
+def load_plan(source: str) -> Plan:
+    """A plan by its name, or from a file. Raises ValueError for what is none."""
+    path = PLANS / f"{source}.toml" if source in plan_names() else Path(source)
+    if not path.is_file():
+        known = ", ".join(plan_names())
+        raise ValueError(f"there is no plan '{source}': give a TOML file or one of {known}")
+    try:
+        data = tomllib.loads(path.read_text())
+        lessons = tuple(Lesson(str(x["name"]), _words(x)) for x in data["lessons"])
+        plan = Plan(str(data["task"]), str(data.get("about", "")).strip(), _words(data), lessons)
+    except (tomllib.TOMLDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"{path} is no plan ({error}): it needs a task and [[lessons]], each with a name and "
+            "options in quotes"
+        ) from None
+    for mistake in _mistakes(plan):
+        raise ValueError(f"{path}: {mistake}")
+    return plan
+
+
+def _words(data: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(shlex.split(data.get("options", "")))
+
+
+def _mistakes(plan: Plan) -> Iterator[str]:
+    if plan.task not in (*task_names(), *APART):
+        yield f"there is no task '{plan.task}'"
+    if not plan.lessons:
+        yield "there is no lesson in it"
+    names = [lesson.name for lesson in plan.lessons]
+    if len(set(names)) < len(names):
+        yield "two lessons have the same name"
+    for name in names:
+        if not re.fullmatch(r"[\w-]+", name):
+            yield f"the name '{name}' must do for a folder: letters, digits, _ and -"
+    told = [*plan.options, *(word for lesson in plan.lessons for word in lesson.options)]
+    for word in told:
+        if word.partition("=")[0] in OURS:
+            yield f"leave {word} out: lessons have a folder each, and go on by themselves"
+
+
+def filled(words: Sequence[str], known: dict[str, str]) -> list[str]:
+    """The words with what ``{NAME}`` stands for in them. Raises ValueError for what is unknown."""
+
+    def value(found: re.Match[str]) -> str:
+        if found[1] not in known:
+            raise ValueError(
+                f"{found[0]} is not known when that lesson begins; known are: {', '.join(known)}"
+            )
+        return known[found[1]]
+
+    return [re.sub(r"\{([\w/]+)\}", value, word) for word in words]
+
+
+def lesson_words(
+    plan: Plan, number: int, extra: Sequence[str], before: Ended | None, out: Path
+) -> list[str]:
+    """What ``train TASK`` is told in a lesson, but for ``--out``.
+
+    Args:
+        plan: whose lesson it is.
+        number: from 0.
+        extra: options that stand above the plan's.
+        before: what the lesson before came to.
+        out: folder of all lessons.
+    """
+    known = {"project": str(PROJECT)}
+    start: list[str] = []
+    if before is not None:
+        known |= {name: f"{value:.4g}" for name, value in before.levels.items()}
+        start = ["--init", str(folder(plan, number - 1, out))]
+    words = filled([*plan.options, *plan.lessons[number].options], known)
+    return [*words, *extra, *start]  # of options told twice the last counts
+
+
+def folder(plan: Plan, number: int, out: Path) -> Path:
+    """Of a lesson's run."""
+    return out / f"{number + 1}_{plan.lessons[number].name}"
+
+
+# -- learning -----------------------------------------------------------------------------------
+
+
+def teach(plan: Plan, out: Path, extra: Sequence[str] = ()) -> list[Ended]:
+    """Trains lesson after lesson, in this process; one that has ended is not begun again.
+
+    Args:
+        plan: what to learn.
+        out: a folder for each lesson, ``lessons.json`` and, when all have ended, the policy.
+        extra: options of ``train`` for all lessons, above the plan's.
+
+    Returns what each lesson came to, fewer than the plan has where a signal ended one.
+    Raises ValueError for options that cannot be and a folder with lessons of another plan, and
+    what ``train`` raises.
+    """
+    for word in extra:
+        if word.partition("=")[0] in OURS:
+            raise ValueError(f"leave {word} out: lessons have a folder each in --out")
+    ended = _ended(plan, out)
+    quiet = False
+    for lesson in ended:
+        print(f"{lesson.sentence()} (before)", flush=True)
+    for number in range(len(ended), len(plan.lessons)):
+        before = ended[-1] if ended else None
+        words = lesson_words(plan, number, extra, before, out)
+        place = folder(plan, number, out)
+        config = parse_args([plan.task, *words, "--out", str(place), "--resume"], "lessons")
+        quiet = config.quiet
+        _tell(quiet, f"lesson {number + 1} of {len(plan.lessons)}: {plan.lessons[number].name}")
+        summary = train(config)
+        _free(config)
+        if summary.stopped_by == "signal":
+            _tell(quiet, "stopped; the same command goes on")
+            return ended
+        name = plan.lessons[number].name
+        counts = (summary.samples, round(summary.minutes, 3), summary.stopped_by)
+        ended.append(Ended(name, *counts, levels(place)))
+        _tell(quiet, ended[-1].sentence())
+        atomic.write_json(out / RECORD, [asdict(lesson) for lesson in ended])
+    policy = read_policy(folder(plan, len(plan.lessons) - 1, out), plan.task)
+    policy.metadata["lessons"] = [_told(plan, k, ended[k], out) for k in range(len(ended))]
+    export_policy(policy, out / POLICY)
+    minutes = sum(lesson.minutes for lesson in ended)
+    samples = sum(lesson.samples for lesson in ended)
+    _tell(quiet, f"{samples:,} samples and {minutes:.1f} minutes in all: {out / POLICY}")
+    return ended
+
+
+def levels(run: Path) -> dict[str, float]:
+    """What a run's figures of ``rl.until.GROUPS`` had come to: means of their last values."""
+    rows = read_progress(run)
+    columns = [name for name in (rows[-1] if rows else ()) if name.startswith(GROUPS)]
+    found = {}
+    for name in columns:
+        values = [row[name] for row in rows if row.get(name) is not None][-ITERATIONS:]
+        if values:
+            found[name] = sum(float(x) for x in values if x is not None) / len(values)
+    return found
+
+
+def _told(plan: Plan, number: int, lesson: Ended, out: Path) -> dict[str, Any]:
+    """For a card: what a lesson came to, and the options of ``train`` that it had but for
+    ``--init``, which is the lesson before."""
+    words = train_words(read_policy(folder(plan, number, out), plan.task).metadata)
+    if number > 0:
+        at = words.index("--init")
+        del words[at : at + 2]
+    told = {"name": lesson.name, "samples": lesson.samples, "minutes": lesson.minutes}
+    return told | {"stopped_by": lesson.stopped_by, "options": shlex.join(words)}
+
+
+def _ended(plan: Plan, out: Path) -> list[Ended]:
+    """The lessons that have ended. Raises ValueError where they are another plan's."""
+    path = out / RECORD
+    if not path.is_file():
+        return []
+    try:
+        data = json.loads(path.read_text())
+        ended = [Ended(**one) for one in data]
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{path} cannot be read ({error})") from None
+    names = [lesson.name for lesson in plan.lessons]
+    if [lesson.name for lesson in ended] != names[: len(ended)]:
+        raise ValueError(f"{out} holds the lessons of another plan: give another --out")
+    return ended
+
+
+def _tell(quiet: bool, text: str) -> None:
+    if not quiet:
+        print(text, flush=True)
+
+
+def _free(config: TrainConfig) -> None:
+    """Gives back what a lesson held on the device before the next one begins."""
+    gc.collect()
+    if config.engine == "warp" and torch.cuda.is_available():
+        torch.cuda.empty_cache()
