@@ -64,7 +64,7 @@ LEAST_MAX, MOST_MAX, RAISE = 0.3, 1.167, 0.15
 PROOF = 0.8
 """Share of h_max that the highest hurdle cleared must have had to count."""
 SLOW = 4.0
-"""Metres a second from hurdle to hurdle that earn no ``haste``."""
+"""Metres a second to a hurdle that earn no ``haste``."""
 
 TAKE_OFF = (0.7, 2.5)
 """Metres before a hurdle in which a leap over it begins. Nearer, a thigh that hits the board is
@@ -127,11 +127,12 @@ class Hurdling:
     only just learned to run are learned at a walk: a policy in latents came to 1.167 m at 4.1 m/s,
     with a squat before and after each, hardly ever fell, and had run 81 m when 20 s were over."""
     haste: float = 0.0
-    """Reward for each second by which the way from one hurdle to the next, or to the finish, takes
-    less than at ``SLOW``; 0 for none, as in the paper. Paid for metres alone at a discount of 0.99,
-    who runs safely gains nothing from running faster: a policy in latents that came to the race's
-    boards with a ``pace`` of 5 m/s ran at 4.9 m/s for 160 M samples more, and had run 95 m when
-    20 s were over."""
+    """Reward for each second by which the way from a standing start to the first hurdle, from one
+    hurdle to the next, or to the finish takes less than at ``SLOW``; 0 for none, as in the paper.
+    Paid for metres alone at a discount of 0.99, who runs safely gains nothing from running faster:
+    a policy in latents that came to the race's boards with a ``pace`` of 5 m/s ran at 4.9 m/s for
+    160 M samples more, and had run 95 m when 20 s were over. With 40 it ran 110 m in 19.3 s after
+    130 M."""
     first_max: float = LEAST_MAX
     """``h_max`` (m) of every world when training begins: what the lesson before this one came to.
     ``--init`` takes an actor over and no heights."""
@@ -484,8 +485,12 @@ def advance(view: View, memory: Memory) -> Advance:
         apart = torch.where(arrives, FINISH_X - (FIRST_X + GAP * (HURDLES - 1)), GAP)
         cleared = cleared.masked_fill(apart < view.config.pace * seconds, 0.0)
         if view.config.haste > 0.0:
-            # The way to its first hurdle begins standing.
-            ran = (further | arrives) & (memory["passed"] > memory["given"]) & ~failed
+            # The way to its first hurdle begins where and when it stood, if it did.
+            opens = memory["standing"] & (memory["passed"] == memory["given"])
+            opening = FIRST_X + GAP * memory["passed"] - memory["start_x"]
+            apart = torch.where(opens, opening, apart)
+            seconds = torch.where(opens, view.clock * view.control_timestep, seconds)
+            ran = (further | arrives) & (opens | (memory["passed"] > memory["given"])) & ~failed
             terms["haste"] = view.config.haste * (apart / SLOW - seconds).clamp(min=0.0) * ran
         shaping["passed_clock"] = torch.where(further, view.clock, memory["passed_clock"])
     over = torch.where(further, height[:, 0], memory["over"])

@@ -570,8 +570,7 @@ def test_a_hurdle_cleared_below_the_pace_raises_nothing(
 def test_haste_pays_for_each_second_less_than_at_four_metres_a_second(
     over: int, to: float, steps: int
 ):
-    """9.14 m in 2.285 s and 14.02 m in 3.505 s earn nothing, and neither does the way to the first
-    hurdle, whose start was standing."""
+    """9.14 m in 2.285 s and 14.02 m in 3.505 s earn nothing, and neither do 0.3 m in 0.367 s."""
     world = at(HURDLE_X[over] - 0.3, z=HIGH, height=0.8, haste=20.0)
     world.env.view.clock += 10
     world.place((HURDLE_X[over] + 0.1, 0.0, HIGH))
@@ -585,6 +584,29 @@ def test_haste_pays_for_each_second_less_than_at_four_metres_a_second(
     assert float(world.advance().terms["haste"]) == pytest.approx(earned, abs=1e-3)
     world.place((to + 0.2, 0.0, HIGH))
     assert float(world.advance().terms["haste"]) == 0.0
+
+
+@pytest.mark.parametrize("first", [0, 3])
+@pytest.mark.parametrize("standing", [True, False])
+@pytest.mark.parametrize("steps", [60, 80, 110])
+def test_haste_pays_for_the_way_to_the_first_hurdle_from_where_it_stood(
+    first: int, standing: bool, steps: int
+):
+    """13.72 m in 3.43 s earn nothing. Who begins before a later one passes the place of a hurdle
+    that was taken away, which earns nothing; who begins in a demonstration was running."""
+    world = at(9.14 * first, z=HIGH, height=0.8, haste=20.0)
+    world.env.memory["given"][:] = first
+    world.env.memory["standing"][:] = standing
+    world.env.memory["marks"][:, :first, 2] = 0.0
+    if first > 0:
+        world.place((HURDLE_X[first - 1] + 0.1, 0.0, HIGH))
+        assert float(world.advance().terms["haste"]) == 0.0
+    world.place((HURDLE_X[first] - 0.2, 0.0, HIGH))
+    assert float(world.advance().terms["haste"]) == 0.0
+    world.env.view.clock += steps - int(world.env.view.clock[0]) - 1
+    world.place((HURDLE_X[first] + 0.1, 0.0, HIGH))
+    earned = 20.0 * max(13.72 / 4.0 - steps / 30.0, 0.0) if standing else 0.0
+    assert float(world.advance().terms["haste"]) == pytest.approx(earned, abs=1e-3)
 
 
 def test_haste_pays_nobody_who_meets_the_hurdle():
