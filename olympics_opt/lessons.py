@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from olympics_opt.recipe import WIDTH
+
 if TYPE_CHECKING:
     from rl.lessons import Plan
 
@@ -18,7 +20,6 @@ USAGE = """usage: olympics-opt lessons PLAN --out FOLDER [--show] [options of tr
 Train a policy in several lessons, one after another, each from what the one before came to.
 Stopped at any moment, the same command goes on. PLAN is a TOML file or one of the project's:
 """
-WIDTH = 96
 
 
 @dataclass(frozen=True)
@@ -69,13 +70,13 @@ def _help() -> str:
 
 def _commands(plan: Plan, extra: list[str]) -> str:
     """What the lessons are told; what only the lesson before can tell is left as it stands."""
-    from rl.lessons import PROJECT
+    from rl.recipe import ROOT
 
     lines = []
     for number, lesson in enumerate(plan.lessons):
         words = ["olympics-opt", "train", plan.task, *plan.options, *lesson.options, *extra]
         words += ["--init", plan.lessons[number - 1].name] if number else []
         words += ["--out", lesson.name]
-        text = shlex.join(word.replace("{project}", str(PROJECT)) for word in words)
+        text = shlex.join(word.replace("{project}", str(ROOT)) for word in words)
         lines.append(f"# {number + 1}. {lesson.name}\n{text}\n")
     return "\n".join(lines)

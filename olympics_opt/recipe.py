@@ -15,18 +15,19 @@ WIDTH = 96
 
 def run_recipe(config: Recipe) -> int:
     """The command. Raises ValueError for a policy that tells nothing of its training."""
-    from rl.recipe import missing, polish_words, train_words
+    from rl.recipe import lessons_before, missing, polish_words, train_words
 
     card = _card(config)
-    words, polished = train_words(card), polish_words(card)
+    before = lessons_before(card)
+    words, polished = train_words(card, init=not before), polish_words(card)
     print(_facts(card))
     run = f"runs/{config.name}"
-    words = _lessons(card, config.name, run, words)
+    words += _lessons(before, card, config.name, run)
     print("\n" + _wrapped([*_starter(card), config.name, "--out", run, *words]))
     told = {"averaged": _mean(card), "polish": _polish(config.name, run, card, polished)}
     for step in card:  # which has what was done to its weights in that order
         print(told.get(step, ""), end="")
-    if lacking := [] if card.get("lessons") else missing(card):
+    if lacking := missing(card):
         text = f"Not in the project: {', '.join(lacking)}."
         if lacking[0] == card["config"].get("init"):
             text += f" To go on from this policy itself, give --init {config.policy} instead."
@@ -36,24 +37,19 @@ def run_recipe(config: Recipe) -> int:
     return 0
 
 
-def _lessons(card: dict[str, Any], task: str, run: str, words: list[str]) -> list[str]:
-    """Prints the commands of the lessons before the last, if it learned in several; returns those
-    of the last, which begins with what the one before it came to."""
-    before = card.get("lessons", [])[:-1]
-    if not before:
-        return words
-    count = f"{len(before) + 1} lessons ({sum(x['minutes'] for x in card['lessons']):.1f} minutes)"
-    print(f"\nIt learned in {count}, one after another:")
+def _lessons(before: list[dict[str, Any]], card: dict[str, Any], task: str, run: str) -> list[str]:
+    """Prints the commands of the lessons before the last; returns the last one's ``--init``."""
     start: list[str] = []
+    if before:
+        minutes = sum(lesson["minutes"] for lesson in card["lessons"])
+        count = f"{len(card['lessons'])} lessons ({minutes:.1f} minutes)"
+        print(f"\nIt learned in {count}, one after another:")
     for number, lesson in enumerate(before, 1):
         place = f"{run}_{number}_{lesson['name']}"
         told = [*_starter(card), task, "--out", place, *shlex.split(lesson["options"]), *start]
         print("\n" + _wrapped(told))
         start = ["--init", place]
-    if "--init" in words:
-        at = words.index("--init")
-        words = [*words[:at], *words[at + 2 :]]
-    return [*words, *start]
+    return start
 
 
 def _mean(card: dict[str, Any]) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -24,7 +24,7 @@ from rl.config import (
     TrainConfig,
     load_placed_starts,
     load_starts,
-    task_options,
+    usual_options,
 )
 from rl.host import RANK_STEP, local_ranks, pick_device, threads_of_each
 from rl.meter import EpisodeMeter
@@ -36,7 +36,6 @@ from rl.rollout import Actor, Rollout
 from rl.warm_start import load_start
 from rl.worlds import engine_options, in_own_worlds
 from sports.env import Env, Starts, make_env
-from sports.registry import task_names
 
 MakeEnv = Callable[[TrainConfig, int], Any]
 """(config, seed) -> environment."""
@@ -270,13 +269,9 @@ def _pays_alike(card: dict[str, Any], config: TrainConfig) -> bool:
     """Whether a critic that came with a policy knows what is paid now: the same discount, rewards
     and options of the same task."""
     then = card.get("config") or {}
-    plain = asdict(task_options(config.task)()) if config.task in (*task_names(), *APART) else {}
-    own = json.loads(json.dumps(asdict(config), default=str))
-    plain = json.loads(json.dumps(plain, default=str))
-
-    def paid(told: dict[str, Any], gamma: float) -> tuple[Any, ...]:
-        rest = (told.get(name) for name in ("task", "algo", "imitation", "impact"))
-        return gamma, plain | (told.get("options") or {}), *rest
-
-    gamma = then.get("ppo", {}).get("gamma")
-    return paid(then, gamma) == paid(own, config.hyper.gamma)
+    names = ("task", "algo", "imitation", "impact")
+    was = [then.get("ppo", {}).get("gamma"), *(then.get(name) for name in names)]
+    if was != [config.hyper.gamma, *(getattr(config, name) for name in names)]:
+        return False
+    usual, own = usual_options(config.task), json.loads(json.dumps(config.options, default=str))
+    return usual | (then.get("options") or {}) == usual | own

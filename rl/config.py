@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -292,6 +293,13 @@ def task_options(task: str) -> type:
 
         return BalanceConfig
     return get_task(task).config
+
+
+def usual_options(task: str) -> dict[str, Any]:
+    """A task's options at their defaults, as JSON has them; none where it is not known."""
+    if task not in (*task_names(), *APART):
+        return {}
+    return json.loads(json.dumps(dataclasses.asdict(task_options(task)()), default=str))
 
 
 def load_starts(paths: tuple[Path, ...], probability: float) -> Starts:

@@ -15,16 +15,19 @@ import json
 import re
 import shlex
 import tomllib
+from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
 
-from rl.config import APART, TrainConfig, parse_args
+from rl.checkpoint import checkpoints, read_state
+from rl.config import APART, parse_args
 from rl.policy import export_policy, read_policy
-from rl.recipe import train_words
+from rl.recipe import ROOT, train_words
 from rl.runlog import read_progress
 from rl.train import train
 from rl.until import GROUPS, ITERATIONS
@@ -32,7 +35,6 @@ from sports.registry import task_names
 from warmstart import atomic
 
 PLANS = Path(__file__).with_name("plans")
-PROJECT = Path(__file__).resolve().parents[1]
 OURS = ("--out", "--resume", "--no-resume")
 """Options that lessons set themselves."""
 RECORD = "lessons.json"
@@ -123,8 +125,12 @@ def _mistakes(plan: Plan) -> Iterator[str]:
     for name in names:
         if not re.fullmatch(r"[\w-]+", name):
             yield f"the name '{name}' must do for a folder: letters, digits, _ and -"
-    told = [*plan.options, *(word for lesson in plan.lessons for word in lesson.options)]
-    for word in told:
+    yield from _ours([*plan.options, *(word for x in plan.lessons for word in x.options)])
+
+
+def _ours(words: Sequence[str]) -> Iterator[str]:
+    """What is wrong with options that lessons set themselves."""
+    for word in words:
         if word.partition("=")[0] in OURS:
             yield f"leave {word} out: lessons have a folder each, and go on by themselves"
 
@@ -154,7 +160,7 @@ def lesson_words(
         before: what the lesson before came to.
         out: folder of all lessons.
     """
-    known = {"project": str(PROJECT)}
+    known = {"project": str(ROOT)}
     start: list[str] = []
     if before is not None:
         known |= {name: f"{value:.4g}" for name, value in before.levels.items()}
@@ -183,28 +189,25 @@ def teach(plan: Plan, out: Path, extra: Sequence[str] = ()) -> list[Ended]:
     Raises ValueError for options that cannot be and a folder with lessons of another plan, and
     what ``train`` raises.
     """
-    for word in extra:
-        if word.partition("=")[0] in OURS:
-            raise ValueError(f"leave {word} out: lessons have a folder each in --out")
+    for mistake in _ours(extra):
+        raise ValueError(mistake)
     ended = _ended(plan, out)
     quiet = False
     for lesson in ended:
         print(f"{lesson.sentence()} (before)", flush=True)
     for number in range(len(ended), len(plan.lessons)):
-        before = ended[-1] if ended else None
-        words = lesson_words(plan, number, extra, before, out)
-        place = folder(plan, number, out)
+        name, place = plan.lessons[number].name, folder(plan, number, out)
+        words = lesson_words(plan, number, extra, ended[-1] if ended else None, out)
         config = parse_args([plan.task, *words, "--out", str(place), "--resume"], "lessons")
         quiet = config.quiet
-        _tell(quiet, f"lesson {number + 1} of {len(plan.lessons)}: {plan.lessons[number].name}")
+        _tell(quiet, f"lesson {number + 1} of {len(plan.lessons)}: {name}")
         summary = train(config)
-        _free(config)
+        _free()
         if summary.stopped_by == "signal":
             _tell(quiet, "stopped; the same command goes on")
             return ended
-        name = plan.lessons[number].name
-        counts = (summary.samples, round(summary.minutes, 3), summary.stopped_by)
-        ended.append(Ended(name, *counts, levels(place)))
+        minutes = round(summary.minutes, 3)
+        ended.append(Ended(name, summary.samples, minutes, summary.stopped_by, levels(place)))
         _tell(quiet, ended[-1].sentence())
         atomic.write_json(out / RECORD, [asdict(lesson) for lesson in ended])
     policy = read_policy(folder(plan, len(plan.lessons) - 1, out), plan.task)
@@ -218,23 +221,19 @@ def teach(plan: Plan, out: Path, extra: Sequence[str] = ()) -> list[Ended]:
 
 def levels(run: Path) -> dict[str, float]:
     """What a run's figures of ``rl.until.GROUPS`` had come to: means of their last values."""
-    rows = read_progress(run)
-    columns = [name for name in (rows[-1] if rows else ()) if name.startswith(GROUPS)]
-    found = {}
-    for name in columns:
-        values = [row[name] for row in rows if row.get(name) is not None][-ITERATIONS:]
-        if values:
-            found[name] = sum(float(x) for x in values if x is not None) / len(values)
-    return found
+    values: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=ITERATIONS))
+    for row in read_progress(run):
+        for name, value in row.items():
+            if name.startswith(GROUPS) and value is not None:
+                values[name].append(value)
+    return {name: fmean(last) for name, last in values.items()}
 
 
 def _told(plan: Plan, number: int, lesson: Ended, out: Path) -> dict[str, Any]:
     """For a card: what a lesson came to, and the options of ``train`` that it had but for
     ``--init``, which is the lesson before."""
-    words = train_words(read_policy(folder(plan, number, out), plan.task).metadata)
-    if number > 0:
-        at = words.index("--init")
-        del words[at : at + 2]
+    state = read_state(checkpoints(folder(plan, number, out))[-1])
+    words = train_words(state["card"], init=number == 0)
     told = {"name": lesson.name, "samples": lesson.samples, "minutes": lesson.minutes}
     return told | {"stopped_by": lesson.stopped_by, "options": shlex.join(words)}
 
@@ -260,8 +259,7 @@ def _tell(quiet: bool, text: str) -> None:
         print(text, flush=True)
 
 
-def _free(config: TrainConfig) -> None:
+def _free() -> None:
     """Gives back what a lesson held on the device before the next one begins."""
     gc.collect()
-    if config.engine == "warp" and torch.cuda.is_available():
-        torch.cuda.empty_cache()
+    torch.cuda.empty_cache()  # which does nothing where none is in use

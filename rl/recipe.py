@@ -24,8 +24,9 @@ OF_THE_RUN = frozenset(
 ROOT = data_folder().parents[1]
 
 
-def train_words(card: Mapping[str, Any]) -> list[str]:
-    """``--option value ...``, what ``olympics-opt train TASK`` is told, but for ``--out``.
+def train_words(card: Mapping[str, Any], init: bool = True) -> list[str]:
+    """``--option value ...``, what ``olympics-opt train TASK`` is told, but for ``--out`` and, not
+    asked for, ``--init``.
 
     Clips that the project holds have their path in it. Raises ValueError for a card without
     settings, or with some that there are no more.
@@ -36,7 +37,8 @@ def train_words(card: Mapping[str, Any]) -> list[str]:
     if told_then.get("task") == PRIOR:  # whose learner is no PPO
         told_then["ppo"] = {}
     config = config_from_dict(told_then)
-    config = replace(config, clips=tuple(_placed(clip) for clip in config.clips))
+    clips = tuple(_placed(clip) for clip in config.clips)
+    config = replace(config, clips=clips, init=config.init if init else None)
     options = _options(config.task, config.options)
     plain = TrainConfig(strength=config.strength)  # which is always told
     told = ["--strength", config.strength, *_words(config, plain)]
@@ -70,12 +72,17 @@ def last_worlds(search: Mapping[str, Any]) -> Mapping[str, Any]:
     return stages[-1]["worlds"]
 
 
+def lessons_before(card: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The lessons before the last, of which the last began with the policy that they came to."""
+    return list(card.get("lessons", ()))[:-1]
+
+
 def missing(card: Mapping[str, Any]) -> list[str]:
     """Files that the training began with and the project does not hold."""
     config = card.get("config") or {}
     names = [str(_placed(clip)) for clip in config.get("clips", ())]
     init = config.get("init")
-    if init is not None and not str(init).startswith("pretrained"):
+    if init is not None and not str(init).startswith("pretrained") and not lessons_before(card):
         names.insert(0, str(init))
     return [name for name in names if not ((ROOT / name).exists() or Path(name).exists())]
 

@@ -18,10 +18,9 @@ from torch import Tensor
 from rl import latent_run, provenance
 from rl.assembly import Assembly
 from rl.checkpoint import checkpoints, load_checkpoint, ranks_of, read_state, save_checkpoint
-from rl.config import APART, TrainConfig, config_from_dict, task_options
+from rl.config import TrainConfig, config_from_dict, usual_options
 from rl.policy import FORMAT as POLICY_FORMAT
 from rl.policy import KEPT, export_policy, learned
-from sports.registry import task_names
 from warmstart.atomic import write_text
 
 FREE = {"out", "resume", "samples", "minutes", "until", "quiet", "checkpoint_minutes"}
@@ -92,11 +91,10 @@ def _same_options(task: str, given: dict[str, Any], own: dict[str, Any]) -> None
     The command line gives every option of the task, asked for or not, so that one at its default
     asks for nothing; lists are what JSON made of the run's tuples.
     """
-    known = (*task_names(), *APART)
-    plain = dataclasses.asdict(task_options(task)()) if task in known else {}
+    plain = usual_options(task)
     for name, value in given.items():
         asked = json.loads(json.dumps(value))
-        default = json.loads(json.dumps(plain.get(name)))
+        default = plain.get(name)
         if asked not in (default, own.get(name, default)):
             raise ValueError(
                 f"{name} {value!r} differs from the run's {own.get(name, default)!r}: a resumed "

@@ -13,7 +13,7 @@ import pytest
 from olympics_opt import cli
 from rl import pretrained
 from rl.config import config_from_dict, parse_args, task_options
-from rl.recipe import OF_THE_RUN, train_words
+from rl.recipe import OF_THE_RUN, missing, train_words
 
 SHIPPED = [(p["task"], f"{p['name']}-{p['strength']}") for p in pretrained.available()]
 
@@ -120,3 +120,11 @@ def test_what_tells_nothing_of_its_training_is_refused(capsys):
 
 def _config() -> dict:
     return pretrained.card(pretrained.locate("long_jump", "ppo"))["config"]
+
+
+def test_what_a_lesson_began_with_is_no_file_that_is_missing():
+    """The lesson before it made that; a clip is missing all the same."""
+    card = {"config": {"init": "runs/gone", "clips": ["runs/gone.npz"]}}
+    assert missing(card) == ["runs/gone", "runs/gone.npz"]
+    assert missing({**card, "lessons": [{}]}) == ["runs/gone", "runs/gone.npz"]
+    assert missing({**card, "lessons": [{}, {}]}) == ["runs/gone.npz"]

@@ -20,8 +20,9 @@ import torch
 from olympics_opt import cli
 from rl.checkpoint import checkpoints, load_checkpoint
 from rl.config import parse_args
-from rl.lessons import PROJECT, Ended, folder, lesson_words, load_plan, plan_names, teach
+from rl.lessons import Ended, folder, lesson_words, load_plan, plan_names, teach
 from rl.policy import load_policy
+from rl.recipe import ROOT
 from rl.until import GROUPS, ITERATIONS
 
 SMALL = "--worlds 4 --ppo.hidden 8 --ppo.steps 4 --quiet"
@@ -102,7 +103,7 @@ def test_after_a_signal_the_same_command_goes_on(tmp_path):
     plan = load_plan(str(written(tmp_path / "plan.toml", PLAN.replace("320", "640"))))
     words = ["-m", "olympics_opt", "lessons", str(tmp_path / "plan.toml")]
     words += ["--out", str(tmp_path / "out"), "--checkpoint-iterations", "1"]
-    env = {**os.environ, "PYTHONPATH": str(PROJECT), "OMP_NUM_THREADS": "1"}
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen([sys.executable, *words], env=env)
     deadline = time.monotonic() + 120
     while len(checkpoints(tmp_path / "out" / "1_low")) < 2:
