@@ -74,7 +74,7 @@ def _commands(plan: Plan, extra: list[str]) -> str:
 
     lines = []
     for number, lesson in enumerate(plan.lessons):
-        words = ["olympics-opt", "train", plan.task, *plan.options, *lesson.options, *extra]
+        words = ["olympics-opt", "train", lesson.task, *plan.options, *lesson.options, *extra]
         words += ["--init", plan.lessons[number - 1].name] if number else []
         words += ["--out", lesson.name]
         text = shlex.join(word.replace("{project}", str(ROOT)) for word in words)

@@ -46,7 +46,8 @@ def _lessons(before: list[dict[str, Any]], card: dict[str, Any], task: str, run:
         print(f"\nIt learned in {count}, one after another:")
     for number, lesson in enumerate(before, 1):
         place = f"{run}_{number}_{lesson['name']}"
-        told = [*_starter(card), task, "--out", place, *shlex.split(lesson["options"]), *start]
+        told = [*_starter(card), lesson.get("task", task), "--out", place]
+        told += [*shlex.split(lesson["options"]), *start]
         print("\n" + _wrapped(told))
         start = ["--init", place]
     return start

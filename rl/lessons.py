@@ -3,9 +3,11 @@
 What a run cannot change while it learns - its discount, what is paid, how long a rollout is - may
 differ from lesson to lesson. A plan is a TOML file: the ``task``, ``options`` of ``train`` that
 hold in all lessons, and ``[[lessons]]`` with a ``name`` and the ``options`` of each. Every lesson
-begins with the policy that the one before came to, its critic too. ``{curriculum/h_max}`` in its
-options is what that column of progress.csv had come to there (the mean of its last values), and
-``{project}`` the folder of this project. Plans of ours are in ``rl/plans``.
+begins with the policy that the one before came to, its critic too. A lesson may name a ``task`` of
+its own, but for the last: who is to hurdle may learn to run as a long jumper (``rl.warm_start``;
+the critic begins anew). ``{curriculum/h_max}`` in its options is what that column of progress.csv
+had come to in the lesson before (the mean of its last values), and ``{project}`` the folder of this
+project. Plans of ours are in ``rl/plans``.
 """
 
 from __future__ import annotations
@@ -48,6 +50,8 @@ class Lesson:
     name: str
     options: tuple[str, ...]
     """Of ``train``; ``{NAME}`` stands for what is known when it begins."""
+    task: str
+    """The plan's, or another."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,7 @@ class Plan:
     """What is learned, and in which order."""
 
     task: str
+    """Of the policy that comes of it."""
     about: str
     """In words, for people."""
     options: tuple[str, ...]
@@ -98,8 +103,11 @@ def load_plan(source: str) -> Plan:
         raise ValueError(f"there is no plan '{source}': give a TOML file or one of {known}")
     try:
         data = tomllib.loads(path.read_text())
-        lessons = tuple(Lesson(str(x["name"]), _words(x)) for x in data["lessons"])
-        plan = Plan(str(data["task"]), str(data.get("about", "")).strip(), _words(data), lessons)
+        task, about = str(data["task"]), str(data.get("about", "")).strip()
+        lessons = tuple(
+            Lesson(str(x["name"]), _words(x), str(x.get("task", task))) for x in data["lessons"]
+        )
+        plan = Plan(task, about, _words(data), lessons)
     except (tomllib.TOMLDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
             f"{path} is no plan ({error}): it needs a task and [[lessons]], each with a name and "
@@ -115,10 +123,13 @@ def _words(data: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _mistakes(plan: Plan) -> Iterator[str]:
-    if plan.task not in (*task_names(), *APART):
-        yield f"there is no task '{plan.task}'"
+    for task in dict.fromkeys((plan.task, *(lesson.task for lesson in plan.lessons))):
+        if task not in (*task_names(), *APART):
+            yield f"there is no task '{task}'"
     if not plan.lessons:
         yield "there is no lesson in it"
+    elif (last := plan.lessons[-1].task) != plan.task:
+        yield f"its task is '{plan.task}', and its last lesson is of '{last}'"
     names = [lesson.name for lesson in plan.lessons]
     if len(set(names)) < len(names):
         yield "two lessons have the same name"
@@ -151,7 +162,7 @@ def filled(words: Sequence[str], known: dict[str, str]) -> list[str]:
 def lesson_words(
     plan: Plan, number: int, extra: Sequence[str], before: Ended | None, out: Path
 ) -> list[str]:
-    """What ``train TASK`` is told in a lesson, but for ``--out``.
+    """What ``train`` is told in a lesson, its task first, but for ``--out``.
 
     Args:
         plan: whose lesson it is.
@@ -166,7 +177,8 @@ def lesson_words(
         known |= {name: f"{value:.4g}" for name, value in before.levels.items()}
         start = ["--init", str(folder(plan, number - 1, out))]
     words = filled([*plan.options, *plan.lessons[number].options], known)
-    return [*words, *extra, *start]  # of options told twice the last counts
+    # Of options told twice the last counts.
+    return [plan.lessons[number].task, *words, *extra, *start]
 
 
 def folder(plan: Plan, number: int, out: Path) -> Path:
@@ -198,7 +210,7 @@ def teach(plan: Plan, out: Path, extra: Sequence[str] = ()) -> list[Ended]:
     for number in range(len(ended), len(plan.lessons)):
         name, place = plan.lessons[number].name, folder(plan, number, out)
         words = lesson_words(plan, number, extra, ended[-1] if ended else None, out)
-        config = parse_args([plan.task, *words, "--out", str(place), "--resume"], "lessons")
+        config = parse_args([*words, "--out", str(place), "--resume"], "lessons")
         quiet = config.quiet
         _tell(quiet, f"lesson {number + 1} of {len(plan.lessons)}: {name}")
         summary = train(config)
@@ -234,8 +246,9 @@ def _told(plan: Plan, number: int, lesson: Ended, out: Path) -> dict[str, Any]:
     ``--init``, which is the lesson before."""
     state = read_state(checkpoints(folder(plan, number, out))[-1])
     words = train_words(state["card"], init=number == 0)
-    told = {"name": lesson.name, "samples": lesson.samples, "minutes": lesson.minutes}
-    return told | {"stopped_by": lesson.stopped_by, "options": shlex.join(words)}
+    told = {"name": lesson.name, "task": plan.lessons[number].task, "samples": lesson.samples}
+    told |= {"minutes": lesson.minutes, "stopped_by": lesson.stopped_by}
+    return told | {"options": shlex.join(words)}
 
 
 def _ended(plan: Plan, out: Path) -> list[Ended]:

@@ -85,6 +85,43 @@ def test_a_lesson_begins_with_what_the_one_before_came_to(tmp_path):
     assert "--init" not in told[1]["options"]
 
 
+OTHER = f"""
+task = "hurdling"
+options = "{SMALL}"
+[[lessons]]
+name = "run"
+task = "long_jump"
+options = "--samples 320 --task.no-somersaults"
+[[lessons]]
+name = "hurdle"
+options = "--samples 48 --task.gap-seen --ppo.critic-warmup 9"
+"""
+
+
+def test_a_lesson_may_be_of_another_task(tmp_path, capsys):
+    """The second begins with the first's actor, whose layers above the first are as they were."""
+    plan = load_plan(str(written(tmp_path / "plan.toml", OTHER)))
+    out = tmp_path / "out"
+    assert [x.samples for x in teach(plan, out)] == [320, 48]
+    run, hurdle = (actor(folder(plan, k, out)) for k in (0, 1))
+    above = {k for k in run if k.startswith("agent/actor.") and "trunk.0." not in k}
+    assert above and all(torch.equal(run[k], hurdle[k]) for k in above)
+    first = "agent/actor.trunk.0.weight"
+    assert hurdle[first].shape != run[first].shape
+
+    policy = load_policy(str(out / "policy.safetensors"), "hurdling")
+    assert [x["task"] for x in policy.metadata["lessons"]] == ["long_jump", "hurdling"]
+    capsys.readouterr()
+    file = str(out / "policy.safetensors")
+    assert cli.main(["recipe", "hurdling", "--policy", file]) == 0
+    parts = capsys.readouterr().out.replace("\\\n", " ").split("\n\n")
+    told = [parse_args(shlex.split(x)[2:]) for x in parts if x.startswith("olympics-opt ")]
+    assert [x.task for x in told] == ["long_jump", "hurdling"]
+    assert told[0].options["somersaults"] is False and told[1].init == str(told[0].out)
+    assert cli.main(["lessons", str(tmp_path / "plan.toml"), "--show"]) == 0
+    assert "olympics-opt train long_jump --worlds" in capsys.readouterr().out
+
+
 def test_lessons_that_have_ended_are_not_begun_again(tmp_path, capsys):
     plan = load_plan(str(written(tmp_path / "plan.toml")))
     out = tmp_path / "out"
@@ -130,7 +167,7 @@ def test_our_plans_can_be_followed(name):
     assert plan.about
     for k, lesson in enumerate(plan.lessons):
         before = Ended("before", 1, 1.0, "samples", known) if k else None
-        config = parse_args([plan.task, *lesson_words(plan, k, ["--worlds", "3"], before, out)])
+        config = parse_args(lesson_words(plan, k, ["--worlds", "3"], before, out))
         assert config.num_worlds == 3, lesson.name  # what is told last counts
         assert config.init == (str(folder(plan, k - 1, out)) if k else None)
         assert config.samples is not None  # minutes would be another plan on another machine
@@ -143,6 +180,8 @@ def test_our_plans_can_be_followed(name):
         ("task = 3 4", "is no plan"),
         ('task = "hurdling"', "needs a task and"),
         ('task = "chess"\nlessons = [{name="a"}]', "no task 'chess'"),
+        ('task = "hurdling"\nlessons = [{name="a", task="chess"}]', "no task 'chess'"),
+        ('task = "golf"\nlessons = [{name="a", task="hurdling"}]', "last lesson is of 'hurdling'"),
         ('task = "hurdling"\nlessons = []', "no lesson in it"),
         ('task = "hurdling"\nlessons = [{name="a"}, {name="a"}]', "same name"),
         ('task = "hurdling"\nlessons = [{name="a/b"}]', "must do for a folder"),
