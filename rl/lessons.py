@@ -171,14 +171,13 @@ def lesson_words(
         before: what the lesson before came to.
         out: folder of all lessons.
     """
-    known = {"project": str(ROOT)}
+    lesson, known = plan.lessons[number], {"project": str(ROOT)}
     start: list[str] = []
     if before is not None:
         known |= {name: f"{value:.4g}" for name, value in before.levels.items()}
         start = ["--init", str(folder(plan, number - 1, out))]
-    words = filled([*plan.options, *plan.lessons[number].options], known)
-    # Of options told twice the last counts.
-    return [plan.lessons[number].task, *words, *extra, *start]
+    words = filled([*plan.options, *lesson.options], known)
+    return [lesson.task, *words, *extra, *start]  # of options told twice the last counts
 
 
 def folder(plan: Plan, number: int, out: Path) -> Path:

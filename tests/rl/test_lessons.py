@@ -19,7 +19,7 @@ import torch
 
 from olympics_opt import cli
 from rl.checkpoint import checkpoints, load_checkpoint
-from rl.config import parse_args
+from rl.config import TrainConfig, parse_args
 from rl.lessons import Ended, folder, lesson_words, load_plan, plan_names, teach
 from rl.policy import load_policy
 from rl.recipe import ROOT
@@ -46,6 +46,15 @@ def written(path: Path, text: str = PLAN) -> Path:
 def actor(run: Path) -> dict[str, torch.Tensor]:
     state = load_checkpoint(checkpoints(run)[-1])[1]
     return {k: x for k, x in state.items() if k.startswith(("agent/actor.", "agent/critic."))}
+
+
+def recipe(policy: Path, capsys) -> tuple[str, list[TrainConfig]]:
+    """What the command prints, and the settings of the trainings in it."""
+    capsys.readouterr()
+    assert cli.main(["recipe", "hurdling", "--policy", str(policy)]) == 0
+    text = capsys.readouterr().out
+    parts = text.replace("\\\n", " ").split("\n\n")
+    return text, [parse_args(shlex.split(x)[2:]) for x in parts if x.startswith("olympics-opt ")]
 
 
 def test_a_lesson_begins_with_what_the_one_before_came_to(tmp_path):
@@ -111,11 +120,7 @@ def test_a_lesson_may_be_of_another_task(tmp_path, capsys):
 
     policy = load_policy(str(out / "policy.safetensors"), "hurdling")
     assert [x["task"] for x in policy.metadata["lessons"]] == ["long_jump", "hurdling"]
-    capsys.readouterr()
-    file = str(out / "policy.safetensors")
-    assert cli.main(["recipe", "hurdling", "--policy", file]) == 0
-    parts = capsys.readouterr().out.replace("\\\n", " ").split("\n\n")
-    told = [parse_args(shlex.split(x)[2:]) for x in parts if x.startswith("olympics-opt ")]
+    _, told = recipe(out / "policy.safetensors", capsys)
     assert [x.task for x in told] == ["long_jump", "hurdling"]
     assert told[0].options["somersaults"] is False and told[1].init == str(told[0].out)
     assert cli.main(["lessons", str(tmp_path / "plan.toml"), "--show"]) == 0
@@ -219,12 +224,7 @@ def test_command_line(tmp_path, capsys):
 def test_the_recipe_tells_all_lessons(tmp_path, capsys):
     plan = load_plan(str(written(tmp_path / "plan.toml")))
     teach(plan, tmp_path / "out")
-    capsys.readouterr()
-    file = str(tmp_path / "out" / "policy.safetensors")
-    assert cli.main(["recipe", "hurdling", "--policy", file]) == 0
-    text = capsys.readouterr().out
-    parts = text.replace("\\\n", " ").split("\n\n")
-    low, high = (parse_args(shlex.split(x)[2:]) for x in parts if x.startswith("olympics-opt "))
+    text, (low, high) = recipe(tmp_path / "out" / "policy.safetensors", capsys)
     assert low.init is None and high.init == str(low.out)
     assert (low.samples, high.samples, high.ppo.gamma) == (320, 48, 0.9)
     assert high.options["first_max"] != 0.3 or low.options["first_max"] == 0.3
