@@ -30,11 +30,21 @@ def told(capsys, *args: str) -> tuple[str, list[list[str]]]:
 @pytest.mark.parametrize("task, name", SHIPPED)
 def test_the_commands_of_a_shipped_policy_give_its_settings(task: str, name: str, capsys):
     card = pretrained.card(pretrained.locate(task, name))
-    text, (train, *polish) = told(capsys, task, "--policy", f"pretrained:{name}")
+    text, commands = told(capsys, task, "--policy", f"pretrained:{name}")
     assert max(map(len, text.splitlines())) <= 96
+    before = card.get("lessons", ())[:-1]
+    lessons, (train, *polish) = commands[: len(before)], commands[len(before) :]
     begin = 2 if train[0] == "olympics-opt" else train.index("rl.train") + 1
     read = parse_args(train[begin:])
     want = config_from_dict({"out": "", **card["config"]})
+    if before:  # each begins with what the one before came to
+        places = [words[words.index("--out") + 1] for words in lessons]
+        starts = [parse_args(words[2:]).init for words in lessons]
+        assert starts == [None, *places[:-1]]
+        want = replace(want, init=places[-1])
+    for words, lesson in zip(lessons, before, strict=True):
+        alone = parse_args([lesson["task"], "--out", "x", *shlex.split(lesson["options"])])
+        assert replace(parse_args(words[2:]), out=alone.out, init=None) == alone
     for field in fields(want):
         if field.name not in OF_THE_RUN | {"clips"}:
             assert getattr(read, field.name) == getattr(want, field.name), field.name
