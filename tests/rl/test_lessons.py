@@ -174,7 +174,10 @@ def test_our_plans_can_be_followed(name):
         before = Ended("before", 1, 1.0, "samples", known) if k else None
         config = parse_args(lesson_words(plan, k, ["--worlds", "3"], before, out))
         assert config.num_worlds == 3, lesson.name  # what is told last counts
-        assert config.init == (str(folder(plan, k - 1, out)) if k else None)
+        if k:
+            assert config.init == str(folder(plan, k - 1, out))
+        else:  # from nothing, or from a policy that is shipped
+            assert config.init is None or Path(config.init).is_file()
         assert config.samples is not None  # minutes would be another plan on another machine
         assert all(clip.is_file() for clip in config.clips)
 
