@@ -18,6 +18,7 @@ import pytest
 import torch
 
 from olympics_opt import cli
+from rl import pretrained
 from rl.checkpoint import checkpoints, load_checkpoint
 from rl.config import TrainConfig, parse_args
 from rl.lessons import Ended, folder, lesson_words, load_plan, plan_names, teach
@@ -163,6 +164,12 @@ def test_after_a_signal_the_same_command_goes_on(tmp_path):
             assert torch.equal(stopped[name], x), name
 
 
+STARTS = {
+    "hurdling_latent_from_long_jump": str(pretrained.locate("long_jump", "latent-human")),
+}
+"""What plans of ours begin with; the others begin from nothing."""
+
+
 @pytest.mark.parametrize("name", plan_names())
 def test_our_plans_can_be_followed(name):
     """Every option of every lesson is one, and its clips are here."""
@@ -174,10 +181,7 @@ def test_our_plans_can_be_followed(name):
         before = Ended("before", 1, 1.0, "samples", known) if k else None
         config = parse_args(lesson_words(plan, k, ["--worlds", "3"], before, out))
         assert config.num_worlds == 3, lesson.name  # what is told last counts
-        if k:
-            assert config.init == str(folder(plan, k - 1, out))
-        else:  # from nothing, or from a policy that is shipped
-            assert config.init is None or Path(config.init).is_file()
+        assert config.init == (str(folder(plan, k - 1, out)) if k else STARTS.get(name))
         assert config.samples is not None  # minutes would be another plan on another machine
         assert all(clip.is_file() for clip in config.clips)
 
