@@ -28,7 +28,7 @@ from rl.config import (
 )
 from rl.host import RANK_STEP, local_ranks, pick_device, threads_of_each
 from rl.meter import EpisodeMeter
-from rl.parts import ImitationReward, Impacts, Lesson, Opponents, Part, Style
+from rl.parts import ImitationReward, Impacts, Lesson, Opponents, Part, Style, TorqueChanges
 from rl.policy import read_policy
 from rl.ppo import PPO, STATISTICS
 from rl.ranks import own_rank
@@ -126,6 +126,8 @@ def assemble(config: TrainConfig, starts: Starts | None, make: MakeEnv) -> Assem
         parts.append(ImitationReward(config, env))
     if config.impact > 0.0:
         parts.append(Impacts(config, env))
+    if config.torque_change > 0.0:
+        parts.append(TorqueChanges(config, env))
     if config.prior is not None:
         latent_run.act_through_prior(env, config)
     agent = _learner(config, env, device)

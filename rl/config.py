@@ -136,6 +136,9 @@ class TrainConfig:
     ``impact_limit``: keeps motion off the hard impacts in which engines differ."""
     impact_limit: float = 5.0
     """Body weights of ground force on a link that cost nothing."""
+    torque_change: float = 0.0
+    """Cost per step of the squared change of each joint's torque since the step before, in shares
+    of its limit, summed: for motion without flutter."""
     paper: bool = False
     """Use the hyper-parameters of the SMPLOlympics paper instead of ``ppo``."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -224,6 +227,8 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
             yield str(error)
     if c.impact < 0.0 or c.impact_limit < 0.0:
         yield "impact and impact_limit must not be negative"
+    if c.torque_change < 0.0:
+        yield f"torque_change must not be negative: {c.torque_change}"
     if not all(0.0 <= p <= 1.0 for p in c.start_probability):
         yield f"start_probability must lie in [0, 1], not {c.start_probability}"
     yield from world_mistakes(c)

@@ -181,7 +181,7 @@ def effort(body: Body, drive: Drive) -> dict[str, float]:
     limit, slope = human.array("effort")[dofs], human.array("kd")[dofs]
     if len(drive.torque) < 2:
         return dict.fromkeys(EFFORT, np.nan)
-    judged = np.array([_measured(human.dofs[i].name) for i in dofs])
+    judged = np.array([measured(human.dofs[i].name) for i in dofs])
     asked = (np.abs(drive.torque + slope * drive.speed) / limit)[..., judged]
     mean = drive.torque.mean(1)
     change = np.abs(np.diff(mean, axis=0)) / drive.dt
@@ -203,7 +203,8 @@ def leg_power(name: str) -> float:
     return sum(d.effort**2 / d.kd / 4.0 for d in dofs)
 
 
-def _measured(dof: str) -> bool:
+def measured(dof: str) -> bool:
+    """Whether the limit of a dof in the human table was measured, not guessed."""
     name = dof.removeprefix("L_").removeprefix("R_")
     return name not in UNMEASURED and name.rpartition("_")[0] not in UNMEASURED
 

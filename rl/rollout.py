@@ -77,7 +77,7 @@ def collect(
         gamma: discount, for the steps still paid after a terminal step.
         on_step: called with every StepResult, for statistics.
         bonuses: StepResult -> (N, A) unscaled reward added to the task's: the imitation term, the
-            cost of impacts.
+            costs of impacts and of torques that jump.
 
     Returns:
         (N, A, D) observation to go on from.
