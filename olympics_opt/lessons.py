@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from olympics_opt.recipe import WIDTH
+from olympics_opt.recipe import WIDTH, wrapped
 
 if TYPE_CHECKING:
     from rl.lessons import Plan
@@ -77,6 +76,6 @@ def _commands(plan: Plan, extra: list[str]) -> str:
         words = ["olympics-opt", "train", lesson.task, *plan.options, *lesson.options, *extra]
         words += ["--init", plan.lessons[number - 1].name] if number else []
         words += ["--out", lesson.name]
-        text = shlex.join(word.replace("{project}", str(ROOT)) for word in words)
+        text = wrapped([word.replace("{project}", str(ROOT)) for word in words])
         lines.append(f"# {number + 1}. {lesson.name}\n{text}\n")
     return "\n".join(lines)

@@ -23,7 +23,7 @@ def run_recipe(config: Recipe) -> int:
     print(_facts(card))
     run = f"runs/{config.name}"
     words += _lessons(before, card, config.name, run)
-    print("\n" + _wrapped([*_starter(card), config.name, "--out", run, *words]))
+    print("\n" + wrapped([*_starter(card), config.name, "--out", run, *words]))
     told = {"averaged": _mean(card), "polish": _polish(config.name, run, card, polished)}
     for step in card:  # which has what was done to its weights in that order
         print(told.get(step, ""), end="")
@@ -48,7 +48,7 @@ def _lessons(before: list[dict[str, Any]], card: dict[str, Any], task: str, run:
         place = f"{run}_{number}_{lesson['name']}"
         told = [*_starter(card), lesson.get("task", task), "--out", place]
         told += [*shlex.split(lesson["options"]), *start]
-        print("\n" + _wrapped(told))
+        print("\n" + wrapped(told))
         start = ["--init", place]
     return start
 
@@ -68,7 +68,7 @@ def _polish(task: str, run: str, card: dict[str, Any], words: list[str] | None) 
     start = [*_polisher(card["polish"]), task, "--policy", run, "--out", f"{run}_polished"]
     episodes = f"{card['polish'].get('episodes', 0):,} episodes"
     text = f"\nThen, {episodes} in all (say how many with --minutes or --generations):\n\n"
-    text += _wrapped([*start, *words]) + "\n"
+    text += wrapped([*start, *words]) + "\n"
     if len(card["polish"].get("stages", ())) > 1:
         text += "That was its last stage of several.\n"
     return text
@@ -123,7 +123,7 @@ def _among(processes: int) -> list[str]:
     return ["torchrun", "--standalone", "--nproc-per-node", str(processes), "-m"]
 
 
-def _wrapped(words: list[str]) -> str:
+def wrapped(words: list[str]) -> str:
     """For a shell; an option stays with its values unless they fill a line."""
     parts: list[list[str]] = [[]]
     for word in words:

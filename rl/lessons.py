@@ -8,6 +8,10 @@ its own, but for the last: who is to hurdle may learn to run as a long jumper (`
 the critic begins anew). ``{curriculum/h_max}`` in its options is what that column of progress.csv
 had come to in the lesson before (the mean of its last values), and ``{project}`` the folder of this
 project. Plans of ours are in ``rl/plans``.
+
+A plan that ``extends`` another, one of ours or a file beside it, is that one but for what it says
+itself: its options stand above the other's, a lesson's above those of the other's lesson with that
+name, lessons with other names follow, and it begins with the lesson that ``first`` names.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import shlex
 import tomllib
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -97,18 +101,10 @@ def plan_names() -> list[str]:
 
 def load_plan(source: str) -> Plan:
     """A plan by its name, or from a file. Raises ValueError for what is none."""
-    path = PLANS / f"{source}.toml" if source in plan_names() else Path(source)
-    if not path.is_file():
-        known = ", ".join(plan_names())
-        raise ValueError(f"there is no plan '{source}': give a TOML file or one of {known}")
+    path = _path(source, Path())
     try:
-        data = tomllib.loads(path.read_text())
-        task, about = str(data["task"]), str(data.get("about", "")).strip()
-        lessons = tuple(
-            Lesson(str(x["name"]), _words(x), str(x.get("task", task))) for x in data["lessons"]
-        )
-        plan = Plan(task, about, _words(data), lessons)
-    except (tomllib.TOMLDecodeError, KeyError, TypeError, AttributeError, ValueError) as error:
+        plan = _read(path, ())
+    except (tomllib.TOMLDecodeError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{path} is no plan ({error}): it needs a task and [[lessons]], each with a name and "
             "options in quotes"
@@ -118,8 +114,65 @@ def load_plan(source: str) -> Plan:
     return plan
 
 
-def _words(data: dict[str, Any]) -> tuple[str, ...]:
-    return tuple(shlex.split(data.get("options", "")))
+def _path(source: str, beside: Path) -> Path:
+    """Of a plan of ours, or a file beside another plan."""
+    path = PLANS / f"{source}.toml" if source in plan_names() else beside / source
+    if not path.is_file():
+        known = ", ".join(plan_names())
+        raise ValueError(f"there is no plan '{source}': give a TOML file or one of {known}")
+    return path
+
+
+def _read(path: Path, behind: tuple[Path, ...]) -> Plan:
+    """A plan, with what those that it extends say; ``behind`` are the plans that extend it."""
+    data = tomllib.loads(path.read_text())
+    if path.resolve() in behind:
+        raise ValueError(f"{path} extends itself")
+    base = None
+    if "extends" in data:
+        base = _read(_path(str(data["extends"]), path.parent), (*behind, path.resolve()))
+        data = {"task": base.task, "about": base.about, "lessons": []} | data
+    elif "first" in data:
+        raise ValueError(f"{path} leaves out lessons before '{data['first']}', and extends no plan")
+    task, about = str(data["task"]), str(data.get("about", "")).strip()
+    kept = {} if base is None else {lesson.name: lesson for lesson in base.lessons}
+    lessons = list(kept.values())
+    for x in data["lessons"]:
+        name, words = str(x["name"]), _words(x, path)
+        old = kept.get(name)
+        lesson = Lesson(name, words, str(x.get("task", old.task if old else task)))
+        if old is None:
+            lessons.append(lesson)
+        else:
+            lesson = replace(lesson, options=_above(words, old.options))
+            lessons[lessons.index(old)] = kept[name] = lesson
+    if (first := data.get("first")) is not None:
+        names = [lesson.name for lesson in lessons]
+        if first not in names:
+            raise ValueError(f"{path} begins with '{first}', and has no lesson of that name")
+        lessons = lessons[names.index(first) :]
+    options = _above(_words(data, path), base.options if base else ())
+    return Plan(task, about, options, tuple(lessons))
+
+
+def _above(words: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
+    """Options and those of ``others`` that are not among them, which stand before."""
+    own = {word.partition("=")[0] for word in words if word.startswith("--")}
+    kept: list[str] = []
+    keep = True
+    for word in others:
+        if word.startswith("--"):
+            keep = word.partition("=")[0] not in own
+        if keep:
+            kept.append(word)
+    return (*kept, *words)
+
+
+def _words(data: dict[str, Any], path: Path) -> tuple[str, ...]:
+    try:
+        return tuple(shlex.split(data.get("options", "")))
+    except ValueError as error:
+        raise ValueError(f"{path} is no plan: options {data['options']!r} ({error})") from None
 
 
 def _mistakes(plan: Plan) -> Iterator[str]:

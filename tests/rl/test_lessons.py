@@ -186,9 +186,41 @@ def test_our_plans_can_be_followed(name):
         assert all(clip.is_file() for clip in config.clips)
 
 
+def test_a_plan_may_extend_another(tmp_path):
+    """What it says stands above, option by option; the rest is the other's."""
+    written(tmp_path / "base.toml", PLAN)
+    middle = """
+    extends = "base.toml"
+    options = "--worlds 3"
+    [[lessons]]
+    name = "high"
+    options = "--samples 96 --task.haste 40 --ppo.gamma=0.8"
+    [[lessons]]
+    name = "last"
+    options = "--samples 12"
+    """
+    written(tmp_path / "middle.toml", middle)
+    plan = load_plan(str(written(tmp_path / "own.toml", 'extends = "middle.toml"\nfirst = "high"')))
+    assert [lesson.name for lesson in plan.lessons] == ["high", "last"]
+    assert plan.options == tuple(f"{SMALL} --task.gap-seen".split()[2:] + ["--worlds", "3"])
+    known = {"curriculum/h_max": 0.5}
+    before = Ended("low", 1, 1.0, "samples", known)
+    high = parse_args(lesson_words(plan, 0, [], before, tmp_path))
+    assert (high.samples, high.ppo.gamma, high.ppo.critic_warmup) == (96, 0.8, 9)
+    assert (high.num_worlds, high.options["haste"], high.options["first_max"]) == (3, 40.0, 0.5)
+    assert plan.lessons[0].options.count("--samples") == 1
+    whole = load_plan(str(tmp_path / "middle.toml"))
+    assert [lesson.name for lesson in whole.lessons] == ["low", "high", "last"]
+    assert whole.lessons[0] == load_plan(str(tmp_path / "base.toml")).lessons[0]
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        ('extends = "plan.toml"', "extends itself"),
+        ('extends = "nowhere"', "no plan 'nowhere'"),
+        ('extends = "hurdling_latent"\nfirst = "walk"', "no lesson of that name"),
+        (f'first = "low"\n{PLAN}', "extends no plan"),
         ("task = 3 4", "is no plan"),
         ('task = "hurdling"', "needs a task and"),
         ('task = "chess"\nlessons = [{name="a"}]', "no task 'chess'"),
@@ -215,7 +247,10 @@ def test_command_line(tmp_path, capsys):
     assert cli.main(["lessons", "--help"]) == 0
     assert "hurdling_latent: " in capsys.readouterr().out
     assert cli.main(["lessons", path, "--show", "--seed", "7"]) == 0
-    lines = [x for x in capsys.readouterr().out.splitlines() if x.startswith("olympics-opt ")]
+    text = capsys.readouterr().out
+    assert all(len(line) < 100 for line in text.splitlines())
+    text = text.replace("\\\n", " ")
+    lines = [x for x in text.splitlines() if x.startswith("olympics-opt ")]
     low = parse_args(shlex.split(lines[0])[2:])
     assert (low.seed, low.samples, low.out.name, low.init) == (7, 320, "low", None)
     assert "--init low" in lines[1] and len(lines) == 2
