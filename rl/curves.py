@@ -26,7 +26,7 @@ DIGITS = 4
 """Of every number that is not whole: more are noise, and most of the file."""
 KEPT = ("samples", "minutes", "return", "episode_steps", "samples_per_s", "nan_worlds", "overflow")
 KEPT += ("middle", "candidates")
-GROUPS = ("metrics/", *(f"{kind}/" for kind in KINDS), "curriculum/")
+GROUPS = ("metrics/", *(f"{kind}/" for kind in KINDS), "curriculum/", "cost/")
 ORIGIN = ("task", "algo", "strength", "limits", "commit", "hardware", "versions", "config")
 
 
@@ -41,7 +41,7 @@ def record_curve(
         out: JSON file, written atomically, on one line: the origin, of its settings those that are
             not ``train``'s usual ones as of ``usual_of``, a commit; and ``rows``, a list of numbers
             (null where there was none) for each column: samples, minutes, mean return and length of
-            episodes, speed, broken worlds, and every metric and curriculum; of a policy that was
+            episodes, speed, broken worlds, and every metric, curriculum and charge; of a policy that was
             polished what ``olympics-opt polish`` wrote, with the origin of that search.
         points: rows to keep, evenly spread.
 
