@@ -41,8 +41,8 @@ def record_curve(
         out: JSON file, written atomically, on one line: the origin, of its settings those that are
             not ``train``'s usual ones as of ``usual_of``, a commit; and ``rows``, a list of numbers
             (null where there was none) for each column: samples, minutes, mean return and length of
-            episodes, speed, broken worlds, and every metric, curriculum and charge; of a policy that was
-            polished what ``olympics-opt polish`` wrote, with the origin of that search.
+            episodes, speed, broken worlds, and every metric, curriculum and charge; of a policy
+            that was polished what ``olympics-opt polish`` wrote, with the origin of that search.
         points: rows to keep, evenly spread.
 
     Raises ValueError for a file without rows or columns of a curve.
