@@ -125,13 +125,10 @@ def _among(processes: int) -> list[str]:
 
 def wrapped(words: list[str]) -> str:
     """For a shell; an option stays with its values unless they fill a line."""
-    parts: list[list[str]] = [[]]
-    for word in words:
-        if word.startswith("--"):
-            parts.append([])
-        parts[-1].append(word)
+    from rl.recipe import by_option
+
     lines = [""]
-    for part in parts:
+    for part in by_option(words):
         for piece in [part] if len(shlex.join(part)) < WIDTH - 8 else [[word] for word in part]:
             text = shlex.join(piece)
             if lines[-1] and len(lines[-1]) + len(text) > WIDTH - 3:

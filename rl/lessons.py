@@ -23,7 +23,8 @@ import shlex
 import tomllib
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -33,7 +34,7 @@ import torch
 from rl.checkpoint import checkpoints, read_state
 from rl.config import APART, parse_args
 from rl.policy import export_policy, read_policy
-from rl.recipe import ROOT, train_words
+from rl.recipe import ROOT, by_option, train_words
 from rl.runlog import read_progress
 from rl.train import train
 from rl.until import GROUPS, ITERATIONS
@@ -102,13 +103,7 @@ def plan_names() -> list[str]:
 def load_plan(source: str) -> Plan:
     """A plan by its name, or from a file. Raises ValueError for what is none."""
     path = _path(source, Path())
-    try:
-        plan = _read(path, ())
-    except (tomllib.TOMLDecodeError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(
-            f"{path} is no plan ({error}): it needs a task and [[lessons]], each with a name and "
-            "options in quotes"
-        ) from None
+    plan = _read(path, ())
     for mistake in _mistakes(plan):
         raise ValueError(f"{path}: {mistake}")
     return plan
@@ -125,47 +120,59 @@ def _path(source: str, beside: Path) -> Path:
 
 def _read(path: Path, behind: tuple[Path, ...]) -> Plan:
     """A plan, with what those that it extends say; ``behind`` are the plans that extend it."""
-    data = tomllib.loads(path.read_text())
-    if path.resolve() in behind:
-        raise ValueError(f"{path} extends itself")
-    base = None
-    if "extends" in data:
-        base = _read(_path(str(data["extends"]), path.parent), (*behind, path.resolve()))
-        data = {"task": base.task, "about": base.about, "lessons": []} | data
-    elif "first" in data:
-        raise ValueError(f"{path} leaves out lessons before '{data['first']}', and extends no plan")
-    task, about = str(data["task"]), str(data.get("about", "")).strip()
-    kept = {} if base is None else {lesson.name: lesson for lesson in base.lessons}
-    lessons = list(kept.values())
-    for x in data["lessons"]:
-        name, words = str(x["name"]), _words(x, path)
-        old = kept.get(name)
-        lesson = Lesson(name, words, str(x.get("task", old.task if old else task)))
-        if old is None:
-            lessons.append(lesson)
+    try:
+        data = tomllib.loads(path.read_text())
+        if path.resolve() in behind:
+            raise ValueError(f"{path} extends itself")
+        if "extends" in data:
+            base = _read(_path(str(data["extends"]), path.parent), (*behind, path.resolve()))
+            data = {"task": base.task, "about": base.about, "lessons": []} | data
         else:
-            lesson = replace(lesson, options=_above(words, old.options))
-            lessons[lessons.index(old)] = kept[name] = lesson
-    if (first := data.get("first")) is not None:
-        names = [lesson.name for lesson in lessons]
-        if first not in names:
-            raise ValueError(f"{path} begins with '{first}', and has no lesson of that name")
-        lessons = lessons[names.index(first) :]
-    options = _above(_words(data, path), base.options if base else ())
+            base = Plan(str(data["task"]), "", (), ())
+        task, about = str(data["task"]), str(data.get("about", "")).strip()
+        old = {lesson.name: lesson for lesson in base.lessons}
+        own = [_lesson(x, old.get(str(x["name"])), task, path) for x in data["lessons"]]
+        options = _above(_words(data, path), base.options)
+    except (tomllib.TOMLDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{path} is no plan ({error}): it needs a task and [[lessons]], each with a name and "
+            "options in quotes"
+        ) from None
+    said = {lesson.name: lesson for lesson in own}
+    lessons = [said.get(lesson.name, lesson) for lesson in base.lessons]
+    lessons += [lesson for lesson in own if lesson.name not in old]
+    if "first" in data:
+        lessons = _from(str(data["first"]), lessons, path, "extends" in data)
     return Plan(task, about, options, tuple(lessons))
+
+
+def _from(first: str, lessons: list[Lesson], path: Path, extends: bool) -> list[Lesson]:
+    """The lessons of a plan from that one on."""
+    names = [lesson.name for lesson in lessons]
+    if not extends:
+        raise ValueError(f"{path} leaves out lessons before '{first}', and extends no plan")
+    if first not in names:
+        raise ValueError(f"{path} begins with '{first}', and has no lesson of that name")
+    return lessons[names.index(first) :]
+
+
+def _lesson(data: dict[str, Any], old: Lesson | None, task: str, path: Path) -> Lesson:
+    """One of a plan; ``old`` is that with its name in the plan which that one extends."""
+    words = _words(data, path)
+    if old is not None:
+        task, words = old.task, _above(words, old.options)
+    return Lesson(str(data["name"]), words, str(data.get("task", task)))
 
 
 def _above(words: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
     """Options and those of ``others`` that are not among them, which stand before."""
-    own = {word.partition("=")[0] for word in words if word.startswith("--")}
-    kept: list[str] = []
-    keep = True
-    for word in others:
-        if word.startswith("--"):
-            keep = word.partition("=")[0] not in own
-        if keep:
-            kept.append(word)
-    return (*kept, *words)
+    own = {_option(group) for group in by_option(words)}
+    kept = [group for group in by_option(others) if _option(group) not in own]
+    return (*chain.from_iterable(kept), *words)
+
+
+def _option(group: Sequence[str]) -> str:
+    return group[0].partition("=")[0]
 
 
 def _words(data: dict[str, Any], path: Path) -> tuple[str, ...]:

@@ -222,5 +222,12 @@ def _drive(body: Body, qpos: np.ndarray, qvel: np.ndarray, targets: np.ndarray, 
     kp, kd, effort = (body.array(f)[dofs] for f in ("kp", "kd", "effort"))
     angle, speed = qpos[:, 7:][:, dofs], qvel[:, 6:][:, dofs]
     both_angle, both_speed = (np.stack((x[:-1], x[1:]), 1) for x in (angle, speed))
-    servo = np.clip(kp * (targets[:, None, dofs] - both_angle), -effort, effort)
-    return Drive(servo - kd * both_speed, both_speed, dt)
+    torque = joint_torque((kp, kd, effort), targets[:, None, dofs], both_angle, both_speed)
+    return Drive(torque, both_speed, dt)
+
+
+def joint_torque(gains: tuple[Any, Any, Any], target: Any, angle: Any, speed: Any) -> Any:
+    """N m of joints: the servo within its limits, less the passive damping. Of arrays or tensors;
+    ``gains`` are kp, kd and effort."""
+    kp, kd, effort = gains
+    return (kp * (target - angle)).clip(-effort, effort) - kd * speed

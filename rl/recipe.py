@@ -7,7 +7,7 @@ defaults is written as options; read again (``rl.config.parse_args``), they give
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,16 @@ def train_words(card: Mapping[str, Any], init: bool = True) -> list[str]:
     plain = TrainConfig(strength=config.strength)  # which is always told
     told = ["--strength", config.strength, *_words(config, plain)]
     return [*told, *_words(options, type(options)(), "task.")]
+
+
+def by_option(words: Iterable[str]) -> list[list[str]]:
+    """Each option with its values; words before the first option stand together."""
+    groups: list[list[str]] = []
+    for word in words:
+        if word.startswith("--") or not groups:
+            groups.append([])
+        groups[-1].append(word)
+    return groups
 
 
 def polish_words(card: Mapping[str, Any]) -> list[str] | None:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rl.likeness_motion import joint_torque
 from rl.likeness_terms import measured
 
 MOST = 2.0
@@ -39,7 +40,7 @@ class TorqueChangeCost:
             torch.tensor(body.array(name), dtype=torch.float32, device=env.device)
             for name in ("kp", "kd", "effort")
         )
-        self.kp, self.kd, self.limit = kp, kd, limit
+        self.gains, self.limit = (kp, kd, limit), limit
         self.counted = torch.tensor([measured(dof.name) for dof in body.dofs], device=env.device)
         """(n,) bool"""
         self.angle, self.speed = self._hinges()
@@ -53,8 +54,9 @@ class TorqueChangeCost:
         """(N, A) bonus, never positive, of the step just taken; 0 in the first step of an episode,
         and where the world was reset."""
         angle, speed = self._hinges()
-        ends = [self._torque(self.angle, self.speed), self._torque(angle, speed)]
-        torque = 0.5 * (ends[0] + ends[1])
+        ctrl = self.env.view.ctrl
+        start = joint_torque(self.gains, ctrl, self.angle, self.speed)
+        torque = 0.5 * (start + joint_torque(self.gains, ctrl, angle, speed))
         change = ((torque - self.torque) / self.limit).abs().clamp(max=MOST).nan_to_num()
         running = ~result.ended & result.valid
         counts = (running & self.known)[:, None]
@@ -62,18 +64,13 @@ class TorqueChangeCost:
         return -self.weight * (change.square() * self.counted).sum(-1) * counts
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What the next step is compared with."""
-        names = ("angle", "speed", "torque", "known")
-        return {name: getattr(self, name).clone() for name in names}
+        """What the next step is compared with, but for the state of the environment."""
+        return {"torque": self.torque.clone(), "known": self.known.clone()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Takes it back."""
-        for name, value in state.items():
-            setattr(self, name, value.to(self.env.device))
-
-    def _torque(self, angle: Tensor, speed: Tensor) -> Tensor:
-        servo = self.kp * (self.env.view.ctrl - angle)
-        return servo.clamp(-self.limit, self.limit) - self.kd * speed
+        """Takes it back, after the environment has taken its own."""
+        self.torque, self.known = (state[k].to(self.env.device) for k in ("torque", "known"))
+        self.angle, self.speed = self._hinges()
 
     def _hinges(self) -> tuple[Tensor, Tensor]:
         """(N, A, n) angles and speeds, copied: the engine writes over its own."""

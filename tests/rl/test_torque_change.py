@@ -67,7 +67,7 @@ def test_nothing_is_paid_across_a_reset_nor_where_the_engine_diverged():
 def test_it_is_the_change_of_the_panels_torques():
     """Against the torques that the panel of human-likeness works out from a recording."""
     env = make_env("long_jump", num_worlds=2, training=False, strength="human", seed=3)
-    cost, tape = TorqueChangeCost(env, 1.0), Tape(env, on=True)
+    tape = Tape(env, on=True)
     generator = torch.Generator().manual_seed(0)
     env.reset()
     cost = TorqueChangeCost(env, 1.0)
