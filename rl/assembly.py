@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from rl import latent_run
+from rl.charges import charges
 from rl.checkpoint import checkpoints
 from rl.config import (
     APART,
@@ -28,7 +29,7 @@ from rl.config import (
 )
 from rl.host import RANK_STEP, local_ranks, pick_device, threads_of_each
 from rl.meter import EpisodeMeter
-from rl.parts import ImitationReward, Impacts, Lesson, Opponents, Part, Style, TorqueChanges
+from rl.parts import ImitationReward, Lesson, Opponents, Part, Style
 from rl.policy import read_policy
 from rl.ppo import PPO, STATISTICS
 from rl.ranks import own_rank
@@ -124,10 +125,7 @@ def assemble(config: TrainConfig, starts: Starts | None, make: MakeEnv) -> Assem
         if starts is None:
             raise ValueError("the imitation reward needs demonstrations: give --clips")
         parts.append(ImitationReward(config, env))
-    if config.impact > 0.0:
-        parts.append(Impacts(config, env))
-    if config.torque_change > 0.0:
-        parts.append(TorqueChanges(config, env))
+    parts.extend(charges(config, env))
     if config.prior is not None:
         latent_run.act_through_prior(env, config)
     agent = _learner(config, env, device)

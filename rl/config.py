@@ -139,6 +139,10 @@ class TrainConfig:
     torque_change: float = 0.0
     """Cost per step of the squared change of each joint's torque since the step before, in shares
     of its limit, summed: for motion without flutter."""
+    charge_limit: float | None = None
+    """Both costs together take at most this share of what the task pays on average, by one factor
+    for both; without it as much as they come to, and where that is more than the pay an athlete
+    learns to fall over at once."""
     paper: bool = False
     """Use the hyper-parameters of the SMPLOlympics paper instead of ``ppo``."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -229,6 +233,11 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
         yield "impact and impact_limit must not be negative"
     if c.torque_change < 0.0:
         yield f"torque_change must not be negative: {c.torque_change}"
+    if c.charge_limit is not None:
+        if not 0.0 < c.charge_limit < 1.0:
+            yield f"charge_limit must lie between 0 and 1: {c.charge_limit}"
+        if not (c.impact or c.torque_change):
+            yield "--charge-limit limits charges: give --impact or --torque-change"
     if not all(0.0 <= p <= 1.0 for p in c.start_probability):
         yield f"start_probability must lie in [0, 1], not {c.start_probability}"
     yield from world_mistakes(c)

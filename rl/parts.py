@@ -18,12 +18,10 @@ from rl.cloning import STATISTIC as CLONE_ERROR
 from rl.cloning import Cloning
 from rl.config import TrainConfig
 from rl.imitation import Imitation
-from rl.impact import ImpactCost
 from rl.ppo import PPO
 from rl.rollout import Actor, Rollout
 from rl.runlog import Row
 from rl.selfplay import SelfPlay
-from rl.torque_change import TorqueChangeCost
 from warmstart.clip import Clip
 
 
@@ -87,51 +85,6 @@ class ImitationReward(Part):
     def schedule(self, share: float) -> None:
         left = max(0.0, 1.0 - share / self.config.imitation_share)
         self.reward.weight.fill_(self.config.imitation * left)
-
-
-class Charge(Part):
-    """A cost of how the athlete moves; the log tells what it came to."""
-
-    def __init__(self, cost: Callable[[Any], Tensor], env: Any) -> None:
-        self.cost = cost
-        self.columns = (f"cost/{self.name}",)
-        self.sum, self.steps = torch.zeros((), device=env.device), 0
-
-    def schedule(self, share: float) -> None:
-        self.sum, self.steps = torch.zeros_like(self.sum), 0
-
-    def bonus(self, result: Any) -> Tensor:
-        bonus = self.cost(result)
-        self.sum, self.steps = self.sum - bonus.mean(), self.steps + 1
-        return bonus
-
-    def learn(self, rollout: Rollout, iteration: int) -> dict[str, Tensor]:
-        return dict.fromkeys(self.columns, self.sum / max(self.steps, 1))
-
-
-class Impacts(Charge):
-    """Of hard impacts."""
-
-    name = "impact"
-
-    def __init__(self, config: TrainConfig, env: Any) -> None:
-        super().__init__(ImpactCost(env, config.impact, config.impact_limit), env)
-
-
-class TorqueChanges(Charge):
-    """Of torques that jump."""
-
-    name = "torque_change"
-    cost: TorqueChangeCost
-
-    def __init__(self, config: TrainConfig, env: Any) -> None:
-        super().__init__(TorqueChangeCost(env, config.torque_change), env)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return self.cost.state_dict()
-
-    def load(self, state: dict[str, Any], tensors: dict[str, Tensor]) -> None:
-        self.cost.load_state_dict(tensors)
 
 
 class Style(Part):

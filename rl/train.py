@@ -20,6 +20,7 @@ from torch import Tensor
 
 from rl import latent_run
 from rl.assembly import Assembly, MakeEnv, assemble, default_env, plays_own
+from rl.charges import ChargeWatch
 from rl.checkpoint import CheckpointError
 from rl.config import DEFAULT_SAMPLES, PRIOR, TrainConfig, load_starts, parse_args
 from rl.host import Signals, Stopwatch, among_ranks, one_torch_thread
@@ -119,7 +120,8 @@ class _Trainer:
             write_config(self.made)
             self._greet()
         self.began = time.monotonic() - 60.0 * self.now.minutes
-        saved_at, saved, watch = self.now.minutes, None, RateWatch(config.hyper)
+        saved_at, saved = self.now.minutes, None
+        watches = (RateWatch(config.hyper), ChargeWatch())
         try:
             with Signals() as signals:
                 while not (stopped_by := self._stopped_by(part, signals)):
@@ -131,9 +133,9 @@ class _Trainer:
                             log = RunLog(config.out, list(row), after, config.quiet)
                         share = self._share()
                         log.write(row, share)
-                        advice = watch(row, share)
-                        if advice is not None and not config.quiet:
-                            print(f"warning: {advice}", file=sys.stderr, flush=True)
+                        for advice in (watch(row, share) for watch in watches):
+                            if advice is not None and not config.quiet:
+                                print(f"warning: {advice}", file=sys.stderr, flush=True)
                         if self.on_iteration is not None:
                             self.on_iteration(row)
                     saved = self._save() if self._save_due(saved_at) else None

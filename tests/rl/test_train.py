@@ -61,7 +61,8 @@ def test_a_resumed_run_repeats_the_uninterrupted_one_bit_for_bit(tmp_path, task,
     small = PPOConfig(hidden=(16, 16), steps=12, minibatches=2, epochs=2, sigma_final=0.06)
     each = 12 * 12
     base = TrainConfig(task=task, worlds=12, samples=4 * each, seed=3, quiet=True, ppo=small)
-    base = dataclasses.replace(base, retries=Retries(retries, (0.1, 0.45)), torque_change=0.05)
+    base = dataclasses.replace(base, retries=Retries(retries, (0.1, 0.45)))
+    base = dataclasses.replace(base, torque_change=0.05, charge_limit=0.5)
     train(dataclasses.replace(base, out=tmp_path / "whole"))
     if retries:
         assert last(tmp_path / "whole")["env/failures/retried"].any()
