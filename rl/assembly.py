@@ -260,18 +260,22 @@ def _begin_from(
     assert policy.actor is not None
     count = policy.metadata["obs_count"]
     agent.load_policy(policy.actor, policy.mean, policy.std, count, seen=~unseen)
-    knows = agent.load_critic(policy.extra) and _pays_alike(policy.metadata, config)
+    knows = agent.load_critic(policy.extra) and pays_alike(policy.metadata, config)
     warmup = 0 if knows else config.hyper.critic_warmup
     return warmup, unseen.to(agent.device) if bool(unseen.any()) else None
 
 
-def _pays_alike(card: dict[str, Any], config: TrainConfig) -> bool:
+def pays_alike(card: dict[str, Any], config: TrainConfig) -> bool:
     """Whether a critic that came with a policy knows what is paid now: the same discount, rewards
     and options of the same task."""
     then = card.get("config") or {}
-    names = ("task", "algo", "imitation", "impact")
-    was = [then.get("ppo", {}).get("gamma"), *(then.get(name) for name in names)]
-    if was != [config.hyper.gamma, *(getattr(config, name) for name in names)]:
+    was = [then.get("ppo", {}).get("gamma"), *(then.get(name) for name in ("task", "algo"))]
+    if was != [config.hyper.gamma, config.task, config.algo]:
         return False
+    usual_pay = TrainConfig(task=config.task)
+    for name in ("imitation", "impact", "impact_limit", "torque_change", "charge_limit"):
+        # A card that is older than a setting was paid as without it.
+        if then.get(name, getattr(usual_pay, name)) != getattr(config, name):
+            return False
     usual, own = usual_options(config.task), json.loads(json.dumps(config.options, default=str))
     return usual | (then.get("options") or {}) == usual | own

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 import rl.checkpoint
-from rl.assembly import default_env
+from rl.assembly import default_env, pays_alike
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.config import config_from_dict
 from rl.policy import PolicyError, load_policy
@@ -231,6 +231,30 @@ def test_a_critic_learns_alone_first_where_something_else_is_paid(tmp_path, chan
     for name in (name for name in before if name.startswith(("agent/actor.", "agent/critic."))):
         same = torch.equal(before[name], after[name])
         assert same == (rests and name.startswith("agent/actor.")), name
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"impact": 0.2},
+        {"impact_limit": 3.0},
+        {"torque_change": 0.5},
+        {"charge_limit": 0.5},
+        {"imitation": 0.1},
+        {"algo": "selfplay"},
+        {"options": {"somersaults": False}},
+    ],
+)
+def test_a_critic_knows_the_pay_that_it_learned_from_and_no_other(changes):
+    config = TrainConfig(task="long_jump", impact=0.1, seed=2)
+    card = json.loads(json.dumps({"config": dataclasses.asdict(config)}, default=str))
+    assert pays_alike(card, dataclasses.replace(config, seed=3, worlds=7))
+    assert not pays_alike(card, dataclasses.replace(config, **changes))
+    for name in ("torque_change", "charge_limit"):  # a card of before there were these
+        del card["config"][name]
+    assert pays_alike(card, config)
+    if set(changes) & {"torque_change", "charge_limit"}:
+        assert not pays_alike(card, dataclasses.replace(config, **changes))
 
 
 @pytest.mark.parametrize("moving", [False, True])
