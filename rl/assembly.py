@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
 import torch
@@ -272,10 +272,10 @@ def pays_alike(card: dict[str, Any], config: TrainConfig) -> bool:
     was = [then.get("ppo", {}).get("gamma"), *(then.get(name) for name in ("task", "algo"))]
     if was != [config.hyper.gamma, config.task, config.algo]:
         return False
-    usual_pay = TrainConfig(task=config.task)
+    without = {f.name: f.default for f in fields(TrainConfig)}
     for name in ("imitation", "impact", "impact_limit", "torque_change", "charge_limit"):
         # A card that is older than a setting was paid as without it.
-        if then.get(name, getattr(usual_pay, name)) != getattr(config, name):
+        if then.get(name, without[name]) != getattr(config, name):
             return False
     usual, own = usual_options(config.task), json.loads(json.dumps(config.options, default=str))
     return usual | (then.get("options") or {}) == usual | own
