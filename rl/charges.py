@@ -10,13 +10,13 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 from rl.config import TrainConfig
 from rl.impact import ImpactCost
 from rl.parts import Part
-from rl.ranks import own_rank
+from rl.ranks import gathered
+from rl.rate_watch import InARow
 from rl.rollout import Rollout
 from rl.runlog import Row
 from rl.torque_change import TorqueChangeCost
@@ -27,8 +27,8 @@ MEMORY = 0.9
 LEAST = 1e-12
 """Pay or charge that is divided by."""
 
-TOO_MUCH, ITERATIONS = 0.8, 20
-"""A share of the pay that is warned of, and in how many iterations in a row."""
+TOO_MUCH = 0.8
+"""A share of the pay that is warned of."""
 
 
 class ChargeLimit(Part):
@@ -59,15 +59,11 @@ class ChargeLimit(Part):
         self.factor = self._factor()
 
     def watch(self, result: Any) -> None:
-        self.sums[0] += (result.reward * result.valid[:, None]).mean()
+        self.sums[0] += torch.where(result.valid[:, None], result.reward, 0.0).mean()
         self.steps += 1
 
     def learn(self, rollout: Rollout, iteration: int) -> dict[str, Tensor]:
-        now = self.sums / max(self.steps, 1)
-        ranks = own_rank()[1]
-        if ranks > 1:
-            dist.all_reduce(now)
-            now = now / ranks
+        now = gathered(self.sums / max(self.steps, 1)).mean(0)
         weight = 1.0 - MEMORY
         self.known = MEMORY * self.known + weight
         self.means = self.means + weight / self.known * (now - self.means)
@@ -86,6 +82,8 @@ class ChargeLimit(Part):
         return {"means": self.means.clone(), "known": self.known.clone()}
 
     def load(self, state: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+        if not tensors:  # of a run that was begun before there was a limit
+            return
         device = self.env.device
         self.means, self.known = (tensors[k].to(device) for k in ("means", "known"))
 
@@ -139,17 +137,13 @@ class ChargeWatch:
     """Looks at the rows of a run that charges without a limit."""
 
     def __init__(self) -> None:
-        self._above = 0
-        """Iterations in a row."""
+        self._long = InARow()
 
     def __call__(self, row: Row, share: float) -> str | None:
         """One sentence, once, where the charges have come near to the pay. ``share`` of the run is
         done, 0..1."""
         charged = row.get("cost/share")
-        if self._above == ITERATIONS or charged is None:
-            return None
-        self._above = self._above + 1 if charged >= TOO_MUCH else 0
-        if self._above < ITERATIONS:
+        if charged is None or not self._long(charged >= TOO_MUCH):
             return None
         return (
             f"the charges take {charged:.0%} of what the task pays, and an athlete may learn to "

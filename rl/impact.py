@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from sports.physics.base import GRAVITY
@@ -36,4 +37,5 @@ class ImpactCost:
         force = self.env.physics.ground_force.norm(dim=-1) / self.unit  # (N, A, B)
         excess = (force - self.limit).clamp(0.0, MOST)
         running = ~result.ended & result.valid
-        return -self.weight * excess.sum(-1) * running[:, None]
+        # Forces of a world that diverged may be no numbers: they must not reach any mean.
+        return torch.where(running[:, None], -self.weight * excess.sum(-1), 0.0)

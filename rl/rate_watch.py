@@ -9,13 +9,26 @@ ITERATIONS = 20
 """In a row, before anything is said."""
 
 
+class InARow:
+    """Counts how often in a row something was so."""
+
+    def __init__(self) -> None:
+        self._times = 0
+
+    def __call__(self, so: bool) -> bool:
+        """Takes an iteration in; True once, when it has been so for ITERATIONS of them."""
+        if self._times == ITERATIONS:
+            return False
+        self._times = self._times + 1 if so else 0
+        return self._times == ITERATIONS
+
+
 class RateWatch:
     """Looks at the rows of a run with PPO's KL control."""
 
     def __init__(self, config: PPOConfig) -> None:
         self.config = config
-        self._above = 0
-        """Iterations in a row."""
+        self._long = InARow()
 
     def __call__(self, row: Row, share: float) -> str | None:
         """One sentence, once, where the divergence has stayed above its band at the least learning
@@ -23,11 +36,10 @@ class RateWatch:
         ``share`` of the run is done, 0..1."""
         band, least = self.config.kl_band_at(share), self.config.learning_rate_limits[0]
         kl, rate = row.get("kl"), row.get("learning_rate")
-        if self._above == ITERATIONS or band is None or kl is None or rate is None:
+        if band is None or kl is None or rate is None:
             return None
         most = band[1]
-        self._above = self._above + 1 if kl > most and rate <= least * 1.001 else 0
-        if self._above < ITERATIONS:
+        if not self._long(kl > most and rate <= least * 1.001):
             return None
         return (
             f"the divergence has been above {most:.3g} for {ITERATIONS} iterations at the least "

@@ -1,4 +1,4 @@
-"""The limit of what a run charges: by hand, in a run, and over processes."""
+"""The limit of what a run charges: by hand, in a run, and over a resume."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from rl.charges import ITERATIONS, Charge, ChargeLimit, ChargeWatch
+from rl.charges import Charge, ChargeLimit, ChargeWatch
 from rl.config import PPOConfig
+from rl.rate_watch import ITERATIONS
 from rl.runlog import read_progress
 from rl.train import TrainConfig, train
 
@@ -68,11 +69,14 @@ def test_where_nothing_is_paid_nothing_is_charged():
         assert not bonus.any() and share == 0.0
 
 
-def test_a_world_whose_engine_diverged_counts_on_neither_side():
+@pytest.mark.parametrize("wild", [1e6, float("nan")])
+def test_a_world_whose_engine_diverged_counts_on_neither_side(wild):
     parts = made(0.5)
     for part in parts:
         part.schedule(0.0)
-    result = SimpleNamespace(reward=torch.tensor([[4.0], [1e6]]), valid=torch.tensor([True, False]))
+    result = SimpleNamespace(
+        reward=torch.tensor([[4.0], [wild]]), valid=torch.tensor([True, False])
+    )
     for charge in parts[1:]:
         charge.bonus(result)
     parts[0].watch(result)
@@ -88,6 +92,9 @@ def test_a_run_goes_on_where_its_means_were():
     again = made(0.5)
     again[0].load({}, stopped[0].state_dict())
     assert torch.equal(iteration(through, 1.0)[0], iteration(again, 1.0)[0])
+    older = made(0.5)
+    older[0].load({}, {})
+    assert iteration(older, 4.0)[0].flatten().tolist() == [-2.0, -4.0], "nothing is known of it"
 
 
 def test_a_run_holds_its_limit(tmp_path):

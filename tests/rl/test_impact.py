@@ -22,7 +22,7 @@ def test_only_the_excess_of_each_link_is_paid_for_and_never_a_reset_world():
     force[0, 0, 1] = torch.tensor([3.0, 0.0, 4.0])  # 5 body weights: 2 too many
     force[0, 0, 2] = torch.tensor([0.0, 0.0, 100.0])  # counted as 30 above the limit
     force[1, 0, 0] = torch.tensor([0.0, 0.0, 2.9])
-    force[2:] = 50.0
+    force[2], force[3] = 50.0, float("nan")  # of the last world the engine diverged
     scene = SimpleNamespace(body=SimpleNamespace(mass=1.0 / 9.81))
     physics = SimpleNamespace(ground_force=force, scene=scene)
     result = ended(4)
