@@ -273,7 +273,8 @@ def pays_alike(card: dict[str, Any], config: TrainConfig) -> bool:
     if was != [config.hyper.gamma, config.task, config.algo]:
         return False
     without = {f.name: f.default for f in fields(TrainConfig)}
-    for name in ("imitation", "impact", "impact_limit", "torque_change", "charge_limit"):
+    charges = ("impact", "impact_limit", "torque_change", "torque_change_limit", "charge_limit")
+    for name in ("imitation", *charges):
         # A card that is older than a setting was paid as without it.
         if then.get(name, without[name]) != getattr(config, name):
             return False

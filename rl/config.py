@@ -138,7 +138,12 @@ class TrainConfig:
     """Body weights of ground force on a link that cost nothing."""
     torque_change: float = 0.0
     """Cost per step of the squared change of each joint's torque since the step before, in shares
-    of its limit, summed: for motion without flutter."""
+    of its limit, as far as it exceeds ``torque_change_limit``, summed: for motion without
+    flutter."""
+    torque_change_limit: float = 0.0
+    """Change of a torque from step to step, in shares of the joint's limit, that costs nothing. A
+    person's changes by about 0.67 at most; in fast motion of many joints nearly all of the cost is
+    of changes below that, unless they are free."""
     charge_limit: float | None = None
     """Both costs together take at most this share of what the task pays on average, by one factor
     for both; without it as much as they come to, and where that is more than the pay an athlete
@@ -231,8 +236,10 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
             yield str(error)
     if c.impact < 0.0 or c.impact_limit < 0.0:
         yield "impact and impact_limit must not be negative"
-    if c.torque_change < 0.0:
-        yield f"torque_change must not be negative: {c.torque_change}"
+    if c.torque_change < 0.0 or c.torque_change_limit < 0.0:
+        yield "torque_change and torque_change_limit must not be negative"
+    if c.torque_change_limit and not c.torque_change:
+        yield "--torque-change-limit is of what is charged: give --torque-change"
     if c.charge_limit is not None:
         if not 0.0 < c.charge_limit < 1.0:
             yield f"charge_limit must lie between 0 and 1: {c.charge_limit}"

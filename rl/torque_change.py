@@ -20,7 +20,8 @@ damping adds to that counts no more."""
 
 
 class TorqueChangeCost:
-    """-weight x the squared change of each dof's torque, in shares of its limit, summed.
+    """-weight x the squared change of each dof's torque beyond what is free, in shares of its
+    limit, summed.
 
     The torque of a step is the mean of those at its start and its end, as in the panel of
     human-likeness (``rl.likeness_terms.effort``): the servo within its limit, less the damping,
@@ -28,12 +29,13 @@ class TorqueChangeCost:
     and others) do not count.
     """
 
-    def __init__(self, env: Any, weight: float) -> None:
+    def __init__(self, env: Any, weight: float, free: float = 0.0) -> None:
         """Args:
         env: environment whose athletes are watched.
         weight: unscaled reward per step and squared limit.
+        free: change from step to step, in shares of the limit, that costs nothing.
         """
-        self.env, self.weight = env, weight
+        self.env, self.weight, self.free = env, weight, free
         body = env.physics.scene.body
         self.agents, self.dofs = env.num_agents, body.num_dofs
         kp, kd, limit = (
@@ -61,7 +63,8 @@ class TorqueChangeCost:
         running = ~result.ended & result.valid
         counts = (running & self.known)[:, None]
         self.angle, self.speed, self.torque, self.known = angle, speed, torque, running
-        return -self.weight * (change.square() * self.counted).sum(-1) * counts
+        beyond = (change - self.free).clamp(min=0.0)
+        return -self.weight * (beyond.square() * self.counted).sum(-1) * counts
 
     def state_dict(self) -> dict[str, Tensor]:
         """What the next step is compared with, but for the state of the environment."""

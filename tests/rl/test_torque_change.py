@@ -23,7 +23,7 @@ def step(ended: bool = False, valid: bool = True) -> SimpleNamespace:
     return SimpleNamespace(ended=torch.tensor([ended]), valid=torch.tensor([valid]))
 
 
-def hand_made() -> tuple[SimpleNamespace, TorqueChangeCost]:
+def hand_made(free: float = 0.0) -> tuple[SimpleNamespace, TorqueChangeCost]:
     """One athlete with a hip, whose limit is known, and a toe, whose limit is not."""
     dofs = [SimpleNamespace(name=n) for n in ("L_Hip_x", "L_Toe_x")]
     values = {"kp": [100.0, 100.0], "kd": [2.0, 2.0], "effort": [50.0, 50.0]}
@@ -35,7 +35,7 @@ def hand_made() -> tuple[SimpleNamespace, TorqueChangeCost]:
     env = SimpleNamespace(
         physics=physics, view=view, num_agents=1, num_worlds=1, device=torch.device("cpu")
     )
-    return env, TorqueChangeCost(env, weight=0.5)
+    return env, TorqueChangeCost(env, weight=0.5, free=free)
 
 
 def test_the_change_is_squared_in_limits_and_guessed_limits_do_not_count():
@@ -50,6 +50,20 @@ def test_the_change_is_squared_in_limits_and_guessed_limits_do_not_count():
     assert cost(step()).item() == pytest.approx(-0.5 * ((5 + 60) / 50) ** 2)
     env.view.ctrl = torch.full((1, 1, 2), 9.0)
     assert cost(step()).item() == pytest.approx(-0.5 * 2.0**2), "from one end to the other"
+
+
+def test_what_a_person_does_may_be_free():
+    """Of each dof by itself: two changes of half of what is free are not one."""
+    env, cost = hand_made(free=0.4)
+    cost(step())
+    env.view.ctrl = torch.full((1, 1, 2), 0.2)  # to 20 N m of 50
+    assert cost(step()).item() == pytest.approx(0.0, abs=1e-12)
+    env.view.ctrl = torch.full((1, 1, 2), -0.3)
+    assert cost(step()).item() == pytest.approx(-0.5 * (50 / 50 - 0.4) ** 2)
+    env.view.ctrl = torch.full((1, 1, 2), -9.0)
+    assert cost(step()).item() == pytest.approx(-0.5 * (20 / 50 - 0.4) ** 2, abs=1e-7)
+    env.view.ctrl = torch.full((1, 1, 2), 9.0)
+    assert cost(step()).item() == pytest.approx(-0.5 * (2.0 - 0.4) ** 2)
 
 
 def test_nothing_is_paid_across_a_reset_nor_where_the_engine_diverged():
@@ -107,5 +121,8 @@ def test_the_log_tells_what_it_came_to(tmp_path):
 
 
 def test_a_negative_cost_is_refused():
-    with pytest.raises(ValueError, match="torque_change must not be negative"):
-        TrainConfig(task="long_jump", torque_change=-0.1)
+    for wrong in ({"torque_change": -0.1}, {"torque_change": 0.1, "torque_change_limit": -0.1}):
+        with pytest.raises(ValueError, match="torque_change_limit must not be negative"):
+            TrainConfig(task="long_jump", **wrong)
+    with pytest.raises(ValueError, match="give --torque-change"):
+        TrainConfig(task="long_jump", torque_change_limit=0.4)

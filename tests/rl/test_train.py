@@ -239,6 +239,7 @@ def test_a_critic_learns_alone_first_where_something_else_is_paid(tmp_path, chan
         {"impact": 0.2},
         {"impact_limit": 3.0},
         {"torque_change": 0.5},
+        {"torque_change": 0.5, "torque_change_limit": 0.4},
         {"charge_limit": 0.5},
         {"imitation": 0.1},
         {"algo": "selfplay"},
@@ -250,10 +251,11 @@ def test_a_critic_knows_the_pay_that_it_learned_from_and_no_other(changes):
     card = json.loads(json.dumps({"config": dataclasses.asdict(config)}, default=str))
     assert pays_alike(card, dataclasses.replace(config, seed=3, worlds=7))
     assert not pays_alike(card, dataclasses.replace(config, **changes))
-    for name in ("torque_change", "charge_limit"):  # a card of before there were these
+    since = ("torque_change", "torque_change_limit", "charge_limit")
+    for name in since:  # a card of before there were these
         del card["config"][name]
     assert pays_alike(card, config)
-    if set(changes) & {"torque_change", "charge_limit"}:
+    if set(changes) & set(since):
         assert not pays_alike(card, dataclasses.replace(config, **changes))
 
 
