@@ -124,8 +124,8 @@ class TorqueChanges(Charge):
     cost: TorqueChangeCost
 
     def __init__(self, config: TrainConfig, env: Any, limit: ChargeLimit) -> None:
-        how = (config.torque_change, config.torque_change_limit)
-        super().__init__(TorqueChangeCost(env, *how), limit)
+        cost = TorqueChangeCost(env, config.torque_change, config.torque_change_limit)
+        super().__init__(cost, limit)
 
     def state_dict(self) -> dict[str, Tensor]:
         return self.cost.state_dict()
