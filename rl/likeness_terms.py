@@ -46,7 +46,8 @@ PERCENTILE = 95.0
 TORQUE_RISE = 20.0
 """Largest torques (of the human table) per second: ten, because the fastest contraction takes
 about 0.1 s to its full torque (Maffiuletti et al. 2016, Eur J Appl Physiol 116:1091), and as many
-for the antagonists that let go. An estimate."""
+for the antagonists that let go. An estimate, of joints that are held still; what moving people show
+is a third more (``rl.likeness.HUMAN_LIMITS``)."""
 LEG_AXES = ("Hip_y", "Knee_y", "Ankle_y")
 UNMEASURED = (
     "Hand",
