@@ -265,6 +265,18 @@ def _begin_from(
     return warmup, unseen.to(agent.device) if bool(unseen.any()) else None
 
 
+CHARGES = (
+    "impact",
+    "impact_limit",
+    "sinking",
+    "sinking_limit",
+    "torque_change",
+    "torque_change_limit",
+    "charge_limit",
+)
+"""Settings of what is charged."""
+
+
 def pays_alike(card: dict[str, Any], config: TrainConfig) -> bool:
     """Whether a critic that came with a policy knows what is paid now: the same discount, rewards
     and options of the same task."""
@@ -273,8 +285,7 @@ def pays_alike(card: dict[str, Any], config: TrainConfig) -> bool:
     if was != [config.hyper.gamma, config.task, config.algo]:
         return False
     without = {f.name: f.default for f in fields(TrainConfig)}
-    charges = ("impact", "impact_limit", "torque_change", "torque_change_limit", "charge_limit")
-    for name in ("imitation", *charges):
+    for name in ("imitation", *CHARGES):
         # A card that is older than a setting was paid as without it.
         if then.get(name, without[name]) != getattr(config, name):
             return False

@@ -19,6 +19,7 @@ from rl.ranks import gathered
 from rl.rate_watch import InARow
 from rl.rollout import Rollout
 from rl.runlog import Row
+from rl.sinking import SinkingCost
 from rl.torque_change import TorqueChangeCost
 
 MEMORY = 0.9
@@ -117,6 +118,15 @@ class Impacts(Charge):
         super().__init__(ImpactCost(env, config.impact, config.impact_limit), limit)
 
 
+class Sinking(Charge):
+    """Of sinking into the ground."""
+
+    name = "sinking"
+
+    def __init__(self, config: TrainConfig, env: Any, limit: ChargeLimit) -> None:
+        super().__init__(SinkingCost(env, config.sinking, config.sinking_limit), limit)
+
+
 class TorqueChanges(Charge):
     """Of torques that jump."""
 
@@ -153,11 +163,14 @@ class ChargeWatch:
 
 
 def charges(config: TrainConfig, env: Any) -> list[Part]:
-    """The limit and the charges that it holds; empty for a run that charges nothing."""
+    """The limit and the charges that it holds; empty for a run that charges nothing. Raises
+    ValueError for a charge that the task cannot have."""
     limit = ChargeLimit(config, env)
     parts: list[Part] = []
     if config.impact > 0.0:
         parts.append(Impacts(config, env, limit))
+    if config.sinking > 0.0:
+        parts.append(Sinking(config, env, limit))
     if config.torque_change > 0.0:
         parts.append(TorqueChanges(config, env, limit))
     return [limit, *parts] if parts else []

@@ -136,6 +136,11 @@ class TrainConfig:
     ``impact_limit``: keeps motion off the hard impacts in which engines differ."""
     impact_limit: float = 5.0
     """Body weights of ground force on a link that cost nothing."""
+    sinking: float = 0.0
+    """Cost per step of each centimetre that the athlete's lowest point is deeper in the ground than
+    ``sinking_limit``: what a cost of impacts does not see of landings that no ground bears."""
+    sinking_limit: float = 0.02
+    """Depth (m) that costs nothing; people sink in by 2.4 cm at most."""
     torque_change: float = 0.0
     """Cost per step of the squared change of each joint's torque since the step before, in shares
     of its limit, as far as it exceeds ``torque_change_limit``, summed: for motion without
@@ -145,8 +150,8 @@ class TrainConfig:
     person's changes by about 0.67 at most; in fast motion of many joints nearly all of the cost is
     of changes below that, unless they are free."""
     charge_limit: float | None = None
-    """Both costs together take at most this share of what the task pays on average, by one factor
-    for both; without it as much as they come to, and where that is more than the pay an athlete
+    """These costs together take at most this share of what the task pays on average, by one factor
+    for all; without it as much as they come to, and where that is more than the pay an athlete
     learns to fall over at once."""
     paper: bool = False
     """Use the hyper-parameters of the SMPLOlympics paper instead of ``ppo``."""
@@ -236,6 +241,8 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
             yield str(error)
     if c.impact < 0.0 or c.impact_limit < 0.0:
         yield "impact and impact_limit must not be negative"
+    if c.sinking < 0.0 or c.sinking_limit < 0.0:
+        yield "sinking and sinking_limit must not be negative"
     if c.torque_change < 0.0 or c.torque_change_limit < 0.0:
         yield "torque_change and torque_change_limit must not be negative"
     if c.torque_change_limit and not c.torque_change:
@@ -243,8 +250,8 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
     if c.charge_limit is not None:
         if not 0.0 < c.charge_limit < 1.0:
             yield f"charge_limit must lie between 0 and 1: {c.charge_limit}"
-        if not (c.impact or c.torque_change):
-            yield "--charge-limit limits charges: give --impact or --torque-change"
+        if not (c.impact or c.sinking or c.torque_change):
+            yield "--charge-limit limits charges: give --impact, --sinking or --torque-change"
     if not all(0.0 <= p <= 1.0 for p in c.start_probability):
         yield f"start_probability must lie in [0, 1], not {c.start_probability}"
     yield from world_mistakes(c)

@@ -129,5 +129,5 @@ def test_a_limit_that_cannot_be_is_refused():
     for value in (0.0, 1.0, -0.5, float("nan")):
         with pytest.raises(ValueError, match="charge_limit must lie between 0 and 1"):
             TrainConfig(task="long_jump", charge_limit=value, impact=0.1)
-    with pytest.raises(ValueError, match="give --impact or --torque-change"):
+    with pytest.raises(ValueError, match="give --impact, --sinking or --torque-change"):
         TrainConfig(task="long_jump", charge_limit=0.5)

@@ -238,6 +238,7 @@ def test_a_critic_learns_alone_first_where_something_else_is_paid(tmp_path, chan
     [
         {"impact": 0.2},
         {"impact_limit": 3.0},
+        {"sinking": 0.2},
         {"torque_change": 0.5},
         {"torque_change": 0.5, "torque_change_limit": 0.4},
         {"charge_limit": 0.5},
