@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from rl import latent_run
-from rl.charges import charges
+from rl.charges import CHARGES, charges
 from rl.checkpoint import checkpoints
 from rl.config import (
     APART,
@@ -263,18 +263,6 @@ def _begin_from(
     knows = agent.load_critic(policy.extra) and pays_alike(policy.metadata, config)
     warmup = 0 if knows else config.hyper.critic_warmup
     return warmup, unseen.to(agent.device) if bool(unseen.any()) else None
-
-
-CHARGES = (
-    "impact",
-    "impact_limit",
-    "sinking",
-    "sinking_limit",
-    "torque_change",
-    "torque_change_limit",
-    "charge_limit",
-)
-"""Settings of what is charged."""
 
 
 def pays_alike(card: dict[str, Any], config: TrainConfig) -> bool:

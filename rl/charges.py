@@ -22,6 +22,17 @@ from rl.runlog import Row
 from rl.sinking import SinkingCost
 from rl.torque_change import TorqueChangeCost
 
+CHARGES = (
+    "impact",
+    "impact_limit",
+    "sinking",
+    "sinking_limit",
+    "torque_change",
+    "torque_change_limit",
+    "charge_limit",
+)
+"""Settings of a run that say what is charged."""
+
 MEMORY = 0.9
 """Of the means of what is paid and charged, from iteration to iteration."""
 

@@ -36,6 +36,11 @@ class ImpactCost:
         """(N, A) bonus, never positive, of the step just taken; 0 where the world was reset."""
         force = self.env.physics.ground_force.norm(dim=-1) / self.unit  # (N, A, B)
         excess = (force - self.limit).clamp(0.0, MOST)
-        running = ~result.ended & result.valid
-        # Forces of a world that diverged may be no numbers: they must not reach any mean.
-        return torch.where(running[:, None], -self.weight * excess.sum(-1), 0.0)
+        return of_running(result, -self.weight * excess.sum(-1))
+
+
+def of_running(result: Any, bonus: Tensor) -> Tensor:
+    """(N, A) bonus of a step, 0 where the world was reset or diverged: what is measured there may
+    be no numbers, and must not reach any mean."""
+    running = ~result.ended & result.valid
+    return torch.where(running[:, None], bonus, 0.0)

@@ -30,9 +30,9 @@ from sports.registry import get_task
 
 HUMAN_LIMITS = {"torque": 1.0, "torque_rate": 1.3, "power": 1.0}
 """Of figures in units of what a person has at most; those per kg say the same in other units. The
-unit of ``torque_rate`` was measured at a joint held still, its limit with people who move: what 95
-of 100 held-out clips of people ask at most of the tracker that follows them
-(``rl.likeness_effort``, results/likeness_effort.json)."""
+unit of ``torque_rate`` is an estimate for a joint held still, its limit is measured: what 95 of 100
+held-out clips of people ask at most of the tracker that follows them (``rl.likeness_effort``,
+results/likeness_effort.json)."""
 ROUNDING = 1e-3
 """Of a limit: an athlete at his limit has not exceeded it."""
 NOTHING = Seen(frozenset(), frozenset())

@@ -1,7 +1,7 @@
 """What the motions of people ask of the athlete's joints: the tracker follows their clips.
 
-A captured clip tells no torques, and how fast a person's torques change has been measured for a
-joint held still only (``rl.likeness_terms.TORQUE_RISE``). So the shipped motion tracker, an athlete
+A captured clip tells no torques, and how fast a person's torques change was an estimate for a joint
+held still (``rl.likeness_terms.TORQUE_RISE``). So the shipped motion tracker, an athlete
 of human strength, follows clips that its training did not see, and what its joints gave is
 measured as that of any policy.
 
@@ -15,7 +15,6 @@ person's own.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -24,17 +23,18 @@ import numpy as np
 
 from rl import provenance
 from rl.following import Follower
-from rl.likeness_motion import captured, from_clip
-from rl.likeness_reference import BAND, non_commercial
-from rl.likeness_terms import EFFORT, figures
+from rl.likeness import HUMAN_LIMITS
+from rl.likeness_motion import from_clip
+from rl.likeness_reference import BAND, people_of
+from rl.likeness_terms import PERCENTILE, figures
+from rl.tracker import LOST
+from rl.tracker_evaluation import number
 from sports.humanoid.body import load_body
 from warmstart.atomic import prepare, write_json
 from warmstart.clip import Clip, finite_difference_qvel
 from warmstart.library import FPS, Library
 
-LOST = 0.5
-"""m from the clip, mean of the links, at which it is not followed any more (Luo et al. 2023)."""
-NAMES = (*EFFORT[:3], "penetration", "jerk")
+NAMES = (*HUMAN_LIMITS, "penetration", "jerk")
 """Figures that are kept."""
 QUANTILES = {"low": BAND[0], "middle": 0.5, "high": BAND[1], "most": 1.0}
 
@@ -49,9 +49,7 @@ def measure(
     what was played; those of a clip that was lost are of the part before.
     """
     rows = []
-    wanted = [
-        i for i, o in enumerate(library.origins) if captured(o) and not non_commercial(o.licence)
-    ]
+    wanted = people_of(library, open_only=True)
     for done, i in enumerate(wanted):
         origin, clip = library.origins[i], clip_of(library, i)
         played = follower(clip, LOST)
@@ -65,7 +63,7 @@ def measure(
                 "followed": played.num_frames == clip.num_frames,
                 "seconds": round(played.duration, 3),
                 "speed": round(speed(clip), 3),
-                **{name: _number(found[name]) for name in NAMES},
+                **{name: number(found[name], 4) for name in NAMES},
             }
         )
         if progress is not None:
@@ -84,7 +82,7 @@ def clip_of(library: Library, index: int) -> Clip:
 def speed(clip: Clip) -> float:
     """m/s of the pelvis along the ground that one frame of twenty exceeds."""
     step = np.linalg.norm(np.diff(clip.qpos[:, :2], axis=0), axis=1) * clip.fps
-    return float(np.quantile(step, 0.95))
+    return float(np.percentile(step, PERCENTILE))
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -102,10 +100,6 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
                 figures_[name] |= {k: round(v, 4) for k, v in found.items()}
         out[split] = {"clips": len(mine), "followed": len(whole), "figures": figures_}
     return out
-
-
-def _number(value: float) -> float | None:
-    return round(float(value), 4) if math.isfinite(value) else None
 
 
 def main(args: Sequence[str] | None = None) -> None:

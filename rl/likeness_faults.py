@@ -17,8 +17,8 @@ import numpy as np
 
 from rl import provenance
 from rl.likeness import panel
-from rl.likeness_motion import Motion, captured, from_library
-from rl.likeness_reference import Reference, non_commercial
+from rl.likeness_motion import Motion, from_library
+from rl.likeness_reference import Reference, people_of
 from sports.humanoid.body import Body, load_body
 from warmstart.atomic import prepare, write_json
 from warmstart.clip import Clip, finite_difference_qvel
@@ -100,12 +100,12 @@ def measure(library: Library, reference: Reference) -> dict[str, dict]:
     """Panels of each archive as it is, and of the openly licensed clips with each fault."""
     train = library.split("train")
     origins = train.origins
-    shown = [i for i, o in enumerate(origins) if captured(o)]
+    shown = people_of(train)
     panels = {}
     for archive in sorted({origins[i].archive for i in shown}):
         mine = _evenly([i for i in shown if origins[i].archive == archive])
         panels[archive] = panel(from_library(train.chosen(mine)), reference)
-    free = _evenly([i for i in shown if not non_commercial(origins[i].licence)])
+    free = _evenly(people_of(train, open_only=True))
     clips = from_library(train.chosen(free))
     panels["people"] = panel(clips, reference)
     for name, fault in FAULTS.items():

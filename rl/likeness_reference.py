@@ -275,12 +275,18 @@ def reference_of_library(library: Library, *, open_only: bool = False) -> Refere
     ``open_only`` leaves out those for non-commercial use. Raises ValueError if none is left.
     """
     held = library.split("held_out")
-    keep = [
+    keep = people_of(held, open_only=open_only)
+    return reference_of(from_library(held.chosen(keep)), library.digest)
+
+
+def people_of(library: Library, *, open_only: bool = False) -> list[int]:
+    """Indices of the clips that show people; ``open_only`` leaves out those for non-commercial
+    use."""
+    return [
         i
-        for i, o in enumerate(held.origins)
+        for i, o in enumerate(library.origins)
         if captured(o) and not (open_only and non_commercial(o.licence))
     ]
-    return reference_of(from_library(held.chosen(keep)), library.digest)
 
 
 def non_commercial(licence: str) -> bool:

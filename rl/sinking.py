@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sports.physics.base import Geometry
+from rl.impact import of_running
 
 CENTIMETRE = 0.01
 MOST = 10.0
@@ -36,16 +36,10 @@ class SinkingCost:
         if scene.has_waves:
             raise ValueError("--sinking is measured from a flat ground, and this task's has waves")
         self.env, self.weight, self.limit = env, weight, limit
-        self.geometry = Geometry(scene.body, env.device)
+        self.down = torch.tensor([0.0, 0.0, -1.0], device=env.device)
 
     def __call__(self, result: Any) -> Tensor:
         """(N, A) bonus, never positive, of the step just taken; 0 where the world was reset."""
-        physics = self.env.physics
-        shape = physics.body_pos.shape[:2]
-        lowest = self.geometry.lowest(
-            physics.body_pos.flatten(0, 1), physics.body_rot.flatten(0, 1)
-        )
-        excess = ((-lowest - self.limit) / CENTIMETRE).clamp(0.0, MOST).unflatten(0, shape)
-        running = ~result.ended & result.valid
-        # Places of a world that diverged may be no numbers: they must not reach any mean.
-        return torch.where(running[:, None], -self.weight * excess, 0.0)
+        depth = self.env.physics.extent(self.down).amax(-1)  # (N, A)
+        excess = ((depth - self.limit) / CENTIMETRE).clamp(0.0, MOST)
+        return of_running(result, -self.weight * excess)

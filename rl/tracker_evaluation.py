@@ -116,7 +116,7 @@ def evaluate_tracker(
         "hardware": provenance.hardware(),
         "splits": summarise(library.origins, rows),
         "clips": [
-            {"name": o.name, **{n: _number(x) for n, x in zip(UNITS, row)}}
+            {"name": o.name, **{n: number(x) for n, x in zip(UNITS, row)}}
             for o, row in zip(library.origins, rows)
         ],
         **trouble,
@@ -190,5 +190,6 @@ def tracking_config(card: dict[str, Any]) -> TrackingConfig:
         raise PolicyError(f"the policy's card has no options of a tracker: {error}") from error
 
 
-def _number(value: float) -> float | None:
-    return round(float(value), 5) if math.isfinite(value) else None
+def number(value: float, digits: int = 5) -> float | None:
+    """A figure for a result, rounded; None where there is none."""
+    return round(float(value), digits) if math.isfinite(value) else None

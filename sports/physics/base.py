@@ -240,11 +240,6 @@ class Geometry:
         aside = (along - x).abs() >= reach
         return torch.where(aside, torch.inf, z - self._padded_radii.T[..., None]).amin((0, 1))
 
-    def lowest(self, body_pos: Tensor, rotation: Tensor) -> Tensor:
-        """(N,) height (m) of the lowest point of athletes; the links as for ``marks``."""
-        z = self._along(body_pos, rotation, 2)
-        return (z - self._padded_radii.T[..., None]).amin((0, 1))
-
     def world_points(self, body_pos: Tensor, body_quat: Tensor) -> Tensor:
         """(..., K, 3) support points in the world; the balls around them have ``radii``."""
         pos, quat = body_pos[..., self.owner, :], body_quat[..., self.owner, :]

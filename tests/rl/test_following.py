@@ -13,12 +13,10 @@ from olympics_opt import cli
 from rl.following import Follower
 from rl.policy import PolicyError
 from sports.humanoid.body import load_body
+from tests.rl.followed import BACKHAND, backhand
 from tests.warmstart.replayed import next_states
-from warmstart.bank import demonstration_files
 from warmstart.clip import Clip
 from warmstart.correction import correct, joint_errors
-
-FILE = next(f for f in demonstration_files("table_tennis") if "backhand" in f.name)
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +26,7 @@ def follower() -> Follower:
 
 @pytest.fixture(scope="module")
 def stroke() -> Clip:
-    return replace(Clip.load(FILE), meta={}, object_qpos=None, object_qvel=None).resample(30.0)
+    return backhand()
 
 
 def test_every_frame_follows_from_the_one_before(follower, stroke):
@@ -71,7 +69,7 @@ def test_the_command_and_its_mistakes(tmp_path: Path, stroke, capsys):
     args = ["mocap", "track", str(tmp_path / "in"), "--tracker", "pretrained"]
     assert cli.main([*args, "--out", str(tmp_path / "no"), "--strength", "paper"]) == 2
     assert "of strength 'human'" in capsys.readouterr().err
-    assert cli.main([*args[:-1], str(FILE), "--out", str(tmp_path / "no")]) == 2
+    assert cli.main([*args[:-1], str(BACKHAND), "--out", str(tmp_path / "no")]) == 2
     assert not (tmp_path / "no").exists()
     result = tmp_path / "result.json"
     assert cli.main([*args, "--out", str(tmp_path / "out"), "--result", str(result)]) == 0

@@ -10,11 +10,7 @@ import torch
 from rl.impact import ImpactCost
 from rl.train import TrainConfig
 from sports.env import make_env
-
-
-def ended(n: int, valid: bool = True) -> SimpleNamespace:
-    no = torch.zeros(n, dtype=torch.bool)
-    return SimpleNamespace(ended=no.clone(), valid=no | valid)
+from tests.rl.steps_made import ended
 
 
 def test_only_the_excess_of_each_link_is_paid_for_and_never_a_reset_world():

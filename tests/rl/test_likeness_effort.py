@@ -13,22 +13,12 @@ from rl.likeness_effort import NAMES, clip_of, measure, speed, summarise
 from rl.likeness_reference import Reference
 from rl.likeness_terms import TORQUE_RISE, measured
 from sports.humanoid.body import load_body
+from tests.rl.followed import backhand
 from tests.rl.motions_still import BODY, slid, standing
-from warmstart.bank import demonstration_files
 from warmstart.clip import Clip, finite_difference_qvel
-from warmstart.library import Library, Origin, pack
+from warmstart.library import pack
 
 SHIPPED = Path(__file__).parents[2] / "results" / "likeness_effort.json"
-FILE = next(f for f in demonstration_files("table_tennis") if "backhand" in f.name)
-
-
-def library_of(clips: list[Clip], licences: list[str]) -> Library:
-    made = pack([(f"archive/clip{i}", clip) for i, clip in enumerate(clips)])
-    origins = tuple(
-        Origin(o.name, "archive", "other", licence, "")
-        for o, licence in zip(made.origins, licences)
-    )
-    return replace(made, origins=origins)
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +28,14 @@ def follower() -> Follower:
 
 @pytest.fixture(scope="module")
 def stroke() -> Clip:
-    return replace(Clip.load(FILE), meta={}, object_qpos=None, object_qvel=None).resample(30.0)
+    return backhand()
 
 
 def test_the_rate_is_that_of_the_servos_of_a_human_athlete(follower, stroke):
-    library = library_of([stroke, stroke], ["MIT", "CC BY-NC 4.0"])
+    licences = ("MIT", "CC BY-NC 4.0")
+    library = pack(
+        (f"archive/clip{i}", replace(stroke, meta={"licence": x})) for i, x in enumerate(licences)
+    )
     rows = measure(library, follower)
     assert [row["name"] for row in rows] == ["archive/clip0"]  # the other may not be used freely
     row = rows[0]

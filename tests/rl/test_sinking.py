@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -14,11 +12,7 @@ from rl.likeness_terms import figures
 from rl.sinking import SinkingCost
 from rl.train import TrainConfig
 from sports.env import make_env
-
-
-def ended(n: int) -> SimpleNamespace:
-    no = torch.zeros(n, dtype=torch.bool)
-    return SimpleNamespace(ended=no.clone(), valid=~no)
+from tests.rl.steps_made import ended
 
 
 def placed(env, depths: list[float]) -> None:
