@@ -27,6 +27,7 @@ CHARGES = (
     "impact_limit",
     "sinking",
     "sinking_limit",
+    "sinking_most",
     "torque_change",
     "torque_change_limit",
     "charge_limit",
@@ -135,7 +136,8 @@ class Sinking(Charge):
     name = "sinking"
 
     def __init__(self, config: TrainConfig, env: Any, limit: ChargeLimit) -> None:
-        super().__init__(SinkingCost(env, config.sinking, config.sinking_limit), limit)
+        cost = SinkingCost(env, config.sinking, config.sinking_limit, config.sinking_most)
+        super().__init__(cost, limit)
 
 
 class TorqueChanges(Charge):

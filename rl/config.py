@@ -141,6 +141,9 @@ class TrainConfig:
     ``sinking_limit``: what a cost of impacts does not see of landings that no ground bears."""
     sinking_limit: float = 0.02
     """Depth (m) that costs nothing; people sink in by 2.4 cm at most."""
+    sinking_most: float = 0.1
+    """Depth (m) beyond ``sinking_limit`` from which on no more costs more: with 0.01 each frame
+    that is too deep counts, and a few landings do not take the most of the cost."""
     torque_change: float = 0.0
     """Cost per step of the squared change of each joint's torque since the step before, in shares
     of its limit, as far as it exceeds ``torque_change_limit``, summed: for motion without
@@ -243,6 +246,8 @@ def _mistakes(c: TrainConfig) -> Iterator[str]:
         yield "impact and impact_limit must not be negative"
     if c.sinking < 0.0 or c.sinking_limit < 0.0:
         yield "sinking and sinking_limit must not be negative"
+    if c.sinking_most <= 0.0:
+        yield f"sinking_most must be positive: {c.sinking_most}"
     if c.torque_change < 0.0 or c.torque_change_limit < 0.0:
         yield "torque_change and torque_change_limit must not be negative"
     if c.torque_change_limit and not c.torque_change:

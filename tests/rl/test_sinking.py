@@ -31,7 +31,7 @@ def still(qpos: torch.Tensor) -> Motion:
 def test_it_is_the_depth_of_the_panel_beyond_what_is_free():
     env = make_env("long_jump", num_worlds=4, training=False)
     placed(env, [0.0, 0.015, 0.034, 0.05])
-    cost = SinkingCost(env, weight=0.5, limit=0.02)(ended(4))
+    cost = SinkingCost(env, weight=0.5, limit=0.02, most=0.1)(ended(4))
     depth = [figures(still(q[:76]))["penetration"] for q in env.physics.qpos]
     expected = [-0.5 * max(0.0, 100.0 * d - 2.0) for d in depth]
     assert cost[:, 0].tolist() == pytest.approx(expected, abs=2e-3)
@@ -45,9 +45,21 @@ def test_a_world_that_was_reset_or_diverged_costs_nothing_and_no_depth_more_than
     result = ended(4)
     result.ended[0], result.valid[1] = True, False
     env.physics.body_pos[1] = torch.nan
-    cost = SinkingCost(env, weight=2.0, limit=0.0)(result)[:, 0]
+    cost = SinkingCost(env, weight=2.0, limit=0.0, most=0.1)(result)[:, 0]
     assert cost[:2].tolist() == [0.0, 0.0] and -12.0 < float(cost[2]) < -8.0
     assert float(cost[3]) == -20.0
+    env.close()
+
+
+def test_beyond_the_most_no_depth_costs_more():
+    env = make_env("long_jump", num_worlds=4, training=False)
+    placed(env, [0.015, 0.03, 0.05, 0.08])
+    config = TrainConfig(task="long_jump", sinking=2.0, sinking_most=0.01)
+    sinking = charges(config, env)[-1].bonus(ended(4))[:, 0].tolist()
+    depth = figures(still(env.physics.qpos[1, :76]))["penetration"]
+    assert 0.02 < depth < 0.03 and sinking[0] == 0.0
+    assert sinking[1] == pytest.approx(-2.0 * (100.0 * depth - 2.0), abs=4e-3)
+    assert sinking[2:] == [pytest.approx(-2.0)] * 2
     env.close()
 
 
@@ -55,7 +67,7 @@ def test_both_athletes_of_a_bout_are_watched():
     env = make_env("boxing", num_worlds=3, training=False)
     env.reset()
     env.physics.body_pos[1, 1, :, 2] -= 0.1
-    cost = SinkingCost(env, weight=1.0, limit=0.02)(ended(3))
+    cost = SinkingCost(env, weight=1.0, limit=0.02, most=0.1)(ended(3))
     assert cost.shape == (3, 2) and int((cost < -5.0).sum()) == 1 and float(cost[1, 1]) < -5.0
     env.close()
 
@@ -75,3 +87,5 @@ def test_it_is_charged_within_the_limit_and_not_on_waves():
 def test_mistakes_are_refused():
     with pytest.raises(ValueError, match="sinking_limit must not be negative"):
         TrainConfig(task="long_jump", sinking=0.1, sinking_limit=-0.01)
+    with pytest.raises(ValueError, match="sinking_most must be positive"):
+        TrainConfig(task="long_jump", sinking=0.1, sinking_most=0.0)
