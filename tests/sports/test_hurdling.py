@@ -131,6 +131,26 @@ def test_a_leap_before_a_hurdle_is_paid_once_and_as_far_as_it_is_needed():
         Hurdling(leap=-1.0)
 
 
+def test_height_over_the_nearest_hurdle_is_charged_beyond_what_is_free():
+    def charged(x: float, z: float, height: float) -> float:
+        world = at(x, skim=2.0, height=height)
+        world.env.memory["marks"][:, 1, 2] = 0.5  # the second
+        world.place((x, 0.0, z))
+        return float(world.advance().terms["skim"][0, 0])
+
+    # Over the first hurdle and 1 m before and after it; between the two the nearer one counts.
+    for x in (13.72, 12.72, 14.72, 18.2):
+        assert charged(x, 1.367, 1.067) == pytest.approx(-0.2, abs=1e-4)
+    assert charged(18.4, 1.367, 1.067) == pytest.approx(-2.0 * (1.367 - 0.95 - 0.2), abs=1e-4)
+    assert charged(13.72, 1.25, 1.067) == 0.0
+    # Who runs is free, however low the hurdle is.
+    assert charged(13.72, 1.14, 0.3) == 0.0
+    assert charged(13.72, 1.25, 0.3) == pytest.approx(-0.2, abs=1e-4)
+    assert "skim" not in at(10.0).advance().terms
+    with pytest.raises(ValueError, match="charge for height"):
+        Hurdling(skim=-1.0)
+
+
 def test_the_middle_of_the_lane_is_free_and_its_sides_are_charged_alike():
     def charged(y: float) -> float:
         world = at(10.0, lane=0.5)
