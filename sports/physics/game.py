@@ -51,7 +51,9 @@ def has_game(scene: Scene) -> bool:
 def build_game(
     scene: Scene, model: mujoco.MjModel, num_worlds: int, wrench: np.ndarray | None = None
 ) -> Game:
-    """The arrays of N worlds, double precision, for a scene that ``has_game``.
+    """The arrays of N worlds for a scene that ``has_game``: what moves the ball in double precision,
+    what is shown (``phases``, ``hit_time``, ``hit_pos``) in single precision in every scene, so that
+    the law is compiled for one kind of arrays.
 
     ``model``: the scene's model of ``mjcf``, for masses. ``wrench``: MuJoCo's ``xfrc_applied``
     (N, bodies, 6), whose bodies are then meant; None for an engine without it: one row for each
@@ -83,15 +85,15 @@ def build_game(
         ball=law.numbers(),
         surfaces=rows,
         tools=np.array([_tool(model, link) for link in links]).reshape(-1, TOOL_NUMBERS),
-        phases=np.zeros((n, 2)),
+        phases=np.zeros((n, 2), np.float32),
         before=np.zeros((n, tools, 7)),
         after=np.zeros((n, tools, 7)),
         pending=np.zeros((n, tools, 6)),
         state=np.zeros((n, STATE_NUMBERS)),
         clock=np.zeros(n),
         hits=np.zeros((n, surfaces), np.int32),
-        hit_time=np.full((n, surfaces), np.inf),
-        hit_pos=np.zeros((n, surfaces, 3)),
+        hit_time=np.full((n, surfaces), np.inf, np.float32),
+        hit_pos=np.zeros((n, surfaces, 3), np.float32),
         places=_integers(places, 2),
         chains=chains,
         offsets=offsets,
