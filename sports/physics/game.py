@@ -51,9 +51,8 @@ def has_game(scene: Scene) -> bool:
 def build_game(
     scene: Scene, model: mujoco.MjModel, num_worlds: int, wrench: np.ndarray | None = None
 ) -> Game:
-    """The arrays of N worlds for a scene that ``has_game``: what moves the ball in double precision,
-    what is shown (``phases``, ``hit_time``, ``hit_pos``) in single precision in every scene, so that
-    the law is compiled for one kind of arrays.
+    """The arrays of N worlds for a scene that ``has_game``, in double precision. What is shown
+    (``phases``, ``hit_time``, ``hit_pos``) is single in every scene: so the law is compiled once.
 
     ``model``: the scene's model of ``mjcf``, for masses. ``wrench``: MuJoCo's ``xfrc_applied``
     (N, bodies, 6), whose bodies are then meant; None for an engine without it: one row for each
