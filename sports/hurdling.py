@@ -564,7 +564,7 @@ def leap(view: View, memory: Memory) -> Tensor:
 def too_high(root: Tensor, heights: Tensor) -> Tensor:
     """(N,) metres by which roots (N, 3) are more than ``SKIM`` over the top of the nearest of the
     hurdles, whose ``heights`` (N, 10) are in m, and over the height that running has."""
-    nearest = ((root[:, 0] - FIRST_X) / GAP).round().nan_to_num_(0.0).clamp_(0.0, HURDLES - 1.0)
+    nearest = hurdles_behind(root[:, 0] + GAP / 2).clamp_(min=1.0) - 1.0
     top = heights.gather(1, nearest.long()[:, None])[:, 0]
     return (root[:, 2] - top.clamp(min=LOW_ROOT) - SKIM).clamp(min=0.0)
 
