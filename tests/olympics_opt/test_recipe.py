@@ -87,7 +87,7 @@ def test_a_mean_is_told_before_a_polish_or_after_it_as_it_was(first, then, tmp_p
 @pytest.mark.parametrize(
     "task, name, said",
     [
-        ("hurdling", "latent-varied", ["mean of 9 states"]),
+        ("hurdling", "latent-varied", ["mean of 4 states"]),
         ("long_jump", "latent", ["mean of 2 states", "13,056 episodes"]),
     ],
 )
