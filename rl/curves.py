@@ -20,7 +20,7 @@ from rl.config import TrainConfig, task_options
 from rl.runlog import KINDS
 from warmstart.atomic import write_json
 
-POINTS = 40
+POINTS = 20
 """Rows that are kept, the first and the last among them."""
 DIGITS = 4
 """Of every number that is not whole: more are noise, and most of the file."""
