@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from rl.amp import AMP, AMPConfig
+from rl.charges import Charge, ChargeLimit
 from rl.clip_sampling import ClipSampling
 from rl.normalizer import Normalizer
 from rl.ppo import PPO, PPOConfig, gaussian_log_prob
@@ -127,6 +128,25 @@ def style(rank: int) -> dict[str, Tensor]:
     return kept | {"own": state["tail"]}
 
 
+def charged(rank: int) -> dict[str, Tensor]:
+    """An iteration of each rank in worlds that pay 2 in the first and 6 in the second, where a
+    charge asks for 1 and 5; what the next takes of it, and what the log tells."""
+    held = ChargeLimit(
+        SimpleNamespace(charge_limit=0.5),  # type: ignore[arg-type]
+        SimpleNamespace(device=torch.device("cpu")),
+    )
+    charge = Charge(lambda result: torch.full((3, 1), -1.0 - 4.0 * rank), held)
+    result = SimpleNamespace(
+        reward=torch.full((3, 1), 2.0 + 4.0 * rank), valid=torch.ones(3, dtype=torch.bool)
+    )
+    for _ in range(4):
+        charge.bonus(result)
+        held.watch(result)
+    told = held.learn(None, 0)  # type: ignore[arg-type]
+    held.schedule(0.0)
+    return {"factor": held.factor, "share": told["cost/share"], "own": charge.bonus(result)}
+
+
 def work(rank: int, ranks: int, folder: Path) -> None:
     """Everything but the runs; writes RANK.safetensors."""
     found = {
@@ -134,6 +154,7 @@ def work(rank: int, ranks: int, folder: Path) -> None:
         "normaliser": normaliser(share(rank, ranks)),
         "sampling": sampling(rank, ranks),
         "style": style(rank),
+        "charges": charged(rank),
     }
     sums, means = over_ranks(torch.tensor([1.0 + rank, 2.0]), torch.tensor([4.0 * rank]))
     found["message"] = {"sums": torch.tensor(sums), "means": torch.tensor(means)}

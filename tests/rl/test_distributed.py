@@ -53,10 +53,19 @@ def test_all_ranks_hold_the_same_bits(ranks):
     zero, one = ranks
     assert zero.keys() == one.keys()
     for name, x in zero.items():
-        if name != "style/own":
+        if not name.endswith("/own"):
             assert torch.equal(x, one[name]), name
     # though each saw motion of its own
     assert not torch.equal(zero["style/own"], one["style/own"])
+
+
+def test_charges_are_held_to_the_mean_pay_of_all_ranks(ranks):
+    """4 are paid in the mean and 3 asked for: 2 may be taken, two thirds of each own."""
+    for rank, found in enumerate(ranks):
+        torch.testing.assert_close(found["charges/factor"], torch.tensor(2 / 3))
+        torch.testing.assert_close(found["charges/share"], torch.tensor(0.5))
+        own = torch.full((3, 1), -(1.0 + 4.0 * rank) * 2 / 3)
+        torch.testing.assert_close(found["charges/own"], own)
 
 
 def test_the_mean_gradient_is_that_of_one_process_with_all_worlds(ranks):
