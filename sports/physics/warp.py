@@ -22,7 +22,8 @@ from sports.physics import warp_kernels as kernels
 from sports.physics.base import Geometry, PhysicsState, diverged
 from sports.physics.game import build_game, has_game
 from sports.physics.variation import Draw, Variation, contact_softness, draw, split_damping
-from sports.physics.warp_factor import faster, pieces
+from sports.physics.warp_pieces import faster
+from sports.physics.warp_tree import trees
 from sports.scene import Scene
 
 ITERATIONS, LINE_SEARCH = 5, 8
@@ -116,7 +117,7 @@ class WarpPhysics:
         contacts = scene.contacts_per_world or 40 + solid // 2
         with wp.ScopedDevice(self._wp_device):
             self.m = mjw.put_model(model)
-            self._pieces = pieces(model)
+            self._trees = trees(model, n)
             self.m.opt.warn_overflow = 0  # counted below, never printed
             self.d = mjw.make_data(model, nworld=n, nconmax=contacts, njmax=rows)
             self._timesteps = [self.m.opt.timestep] * scene.substeps
@@ -358,7 +359,7 @@ class WarpPhysics:
             if self._felt is not None:
                 inputs = [self._felt, d.qvel]
                 wp.launch(kernels.damp, dim=d.qvel.shape, inputs=inputs, outputs=[d.qfrc_applied])
-            with faster(self._pieces):
+            with faster(self._trees):
                 mjw.step(self.m, d)
             if self._turns:
                 self._ask_law("turn_worlds", self._timesteps[i])
