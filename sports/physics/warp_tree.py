@@ -39,6 +39,9 @@ from mujoco_warp._src import types
 
 COUPLED = 44
 """Rows of contacts between two bodies that move that a world solves exactly."""
+COUPLERS = 128
+"""Threads of a block for Newton's direction: few of the worlds that iterate to the end are not
+coupled, and what couples them has more to do side by side than a level of a tree."""
 
 _COLUMNS = ("body", "parent", "root", "dof", "dofs", "child", "children")
 """Of the table of bodies: the body's own number; its parent's row (-1: none); the root's number;
@@ -76,65 +79,87 @@ _SOLVE = """
         push[k] = wanted[k];
     }
 $constraints
-    WP_TILE_SYNC();
     for (int level = levels - 1; level >= 0; --level) {
-        for (int i = begin.data[level] + lane; i < begin.data[level + 1]; i += lanes) {
+        const int end = begin.data[level + 1];
+        int i = begin.data[level] + lane;
+        float I[21], P[6], S[18];
+        // What of a body needs nothing of its children comes first: it is waited for together.
+        auto fetch = [&]() {
             const int* row = rows + 7 * i;
             const float* own = inertias + 10 * row[0];
-            float I[21], P[6];
             for (int e = 0; e < 21; ++e)
-                I[e] = slot[i * 27 + e];
+                I[e] = 0.0f;
+            I[AT(0, 0)] = own[0]; I[AT(1, 1)] = own[1]; I[AT(2, 2)] = own[2];
+            I[AT(0, 1)] = own[3]; I[AT(0, 2)] = own[4]; I[AT(1, 2)] = own[5];
+            I[AT(0, 4)] = -own[8]; I[AT(0, 5)] = own[7]; I[AT(1, 3)] = own[8];
+            I[AT(1, 5)] = -own[6]; I[AT(2, 3)] = -own[7]; I[AT(2, 4)] = own[6];
+            I[AT(3, 3)] = own[9]; I[AT(4, 4)] = own[9]; I[AT(5, 5)] = own[9];
+            const float* s = axes + 6 * (row[3] + row[4] - 1);
+            for (int q = 0; q < 3; ++q)
+                for (int e = 0; e < 6; ++e)
+                    S[6 * q + e] = q < row[4] ? s[e - 6 * q] : 0.0f;
+        };
+        auto take = [&](int k, const float* s) {
+            float U[6], pivot = along[k * 7 + 6], u = push[k];
+            for (int r = 0; r < 6; ++r) {
+                float sum = 0.0f;
+                for (int c = 0; c < 6; ++c)
+                    sum += I[r < c ? AT(r, c) : AT(c, r)] * s[c];
+                U[r] = sum;
+                pivot += sum * s[r];
+                u -= s[r] * P[r];
+            }
+            const float inverse = 1.0f / pivot, share = u * inverse;
+            for (int r = 0; r < 6; ++r) {
+                const float scaled = U[r] * inverse;
+                for (int c = r; c < 6; ++c)
+                    I[AT(r, c)] -= scaled * U[c];
+                P[r] += U[r] * share;
+                along[k * 7 + r] = U[r];
+            }
+            along[k * 7 + 6] = inverse;
+            push[k] = u;
+        };
+        if (i < end)
+            fetch();
+        WP_TILE_SYNC();
+        while (i < end) {
+            const int* row = rows + 7 * i;
+            for (int e = 0; e < 21; ++e)
+                I[e] += slot[i * 27 + e];
             for (int e = 0; e < 6; ++e)
                 P[e] = 0.0f;
-            I[AT(0, 0)] += own[0]; I[AT(1, 1)] += own[1]; I[AT(2, 2)] += own[2];
-            I[AT(0, 1)] += own[3]; I[AT(0, 2)] += own[4]; I[AT(1, 2)] += own[5];
-            I[AT(0, 4)] -= own[8]; I[AT(0, 5)] += own[7]; I[AT(1, 3)] += own[8];
-            I[AT(1, 5)] -= own[6]; I[AT(2, 3)] -= own[7]; I[AT(2, 4)] += own[6];
-            I[AT(3, 3)] += own[9]; I[AT(4, 4)] += own[9]; I[AT(5, 5)] += own[9];
             for (int j = row[5]; j < row[5] + row[6]; ++j) {
                 for (int e = 0; e < 21; ++e)
                     I[e] += slot[j * 27 + e];
                 for (int e = 0; e < 6; ++e)
                     P[e] += slot[j * 27 + 21 + e];
             }
-            for (int k = row[3] + row[4] - 1; k >= row[3]; --k) {
-                const float* s = axes + 6 * k;
-                float U[6], pivot = along[k * 7 + 6], u = push[k];
-                for (int r = 0; r < 6; ++r) {
-                    float sum = 0.0f;
-                    for (int c = 0; c < 6; ++c)
-                        sum += I[r < c ? AT(r, c) : AT(c, r)] * s[c];
-                    U[r] = sum;
-                    pivot += sum * s[r];
-                    u -= s[r] * P[r];
-                }
-                const float inverse = 1.0f / pivot, share = u * inverse;
-                for (int r = 0; r < 6; ++r) {
-                    const float scaled = U[r] * inverse;
-                    for (int c = r; c < 6; ++c)
-                        I[AT(r, c)] -= scaled * U[c];
-                    P[r] += U[r] * share;
-                    along[k * 7 + r] = U[r];
-                }
-                along[k * 7 + 6] = inverse;
-                push[k] = u;
-            }
+            const int last = row[3] + row[4] - 1;
+            for (int q = 0; q < 3; ++q)
+                if (q < row[4])
+                    take(last - q, S + 6 * q);
+            for (int k = last - 3; k >= row[3]; --k)
+                take(k, axes + 6 * k);
             for (int e = 0; e < 21; ++e)
                 slot[i * 27 + e] = I[e];
             for (int e = 0; e < 6; ++e)
                 slot[i * 27 + 21 + e] = P[e];
+            i += lanes;
+            if (i < end)
+                fetch();
         }
-        WP_TILE_SYNC();
     }
+    WP_TILE_SYNC();
 $coupling
     for (int level = 0; level < levels; ++level) {
         for (int i = begin.data[level] + lane; i < begin.data[level + 1]; i += lanes) {
             const int* row = rows + 7 * i;
-            float A[6];
-            for (int e = 0; e < 6; ++e)
-                A[e] = row[1] < 0 ? 0.0f : slot[row[1] * 27 + 21 + e];
-            for (int k = row[3]; k < row[3] + row[4]; ++k) {
-                const float* s = axes + 6 * k;
+            float A[6], S[18];
+            for (int q = 0; q < 3; ++q)
+                for (int e = 0; e < 6; ++e)
+                    S[6 * q + e] = q < row[4] ? axes[6 * (row[3] + q) + e] : 0.0f;
+            auto give = [&](int k, const float* s) {
                 float x = push[k];
                 for (int e = 0; e < 6; ++e)
                     x -= along[k * 7 + e] * A[e];
@@ -142,7 +167,14 @@ $coupling
                 for (int e = 0; e < 6; ++e)
                     A[e] += s[e] * x;
                 push[k] = x;
-            }
+            };
+            for (int e = 0; e < 6; ++e)
+                A[e] = row[1] < 0 ? 0.0f : slot[row[1] * 27 + 21 + e];
+            for (int q = 0; q < 3; ++q)
+                if (q < row[4])
+                    give(row[3] + q, S + 6 * q);
+            for (int k = row[3] + 3; k < row[3] + row[4]; ++k)
+                give(k, axes + 6 * k);
             for (int e = 0; e < 6; ++e)
                 slot[i * 27 + 21 + e] = A[e];
         }
@@ -236,6 +268,7 @@ _COUPLING = """
     if (n > 0) {
         SHARED float K[COUPLED * (COUPLED + 1) / 2];  // the lower triangle, row by row
         SHARED float z[COUPLED];
+        SHARED int ends[COUPLED][3];  // rows of both bodies, length of what their paths share
         float* V = (float*)((char*)scratch.data + world * scratch.strides[0]);
         for (int e = lane; e < DOFS * n; e += lanes)
             V[e] = 0.0f;
@@ -249,10 +282,14 @@ _COUPLING = """
             wrench(e, b, P[1]);
             for (int x = 0; x < 6; ++x)
                 P[1][x] = -P[1][x];
+            ends[c][0] = a;
+            ends[c][1] = b;
+            ends[c][2] = 0;
             while (a >= 0 || b >= 0) {
                 if (a == b) {
                     for (int x = 0; x < 6; ++x)
                         P[0][x] += P[1][x];
+                    ends[c][2] = stops.data[a + 1] - stops.data[a];
                     b = -1;
                 }
                 const int side = b > a, i = side ? b : a;
@@ -282,14 +319,24 @@ _COUPLING = """
             }
         }
         WP_TILE_SYNC();
-        // K and the right side.
-        for (int e = lane; e < n * (n + 1); e += lanes) {
-            const int i = e / (n + 1), j = e % (n + 1) - 1;
-            if (j > i)
-                continue;
+        // K and the right side: u_i is not zero along two paths.
+        for (int e = lane; e < n * (n + 3) / 2; e += lanes) {
+            int i = (int)((sqrtf(8.0f * e + 9.0f) - 3.0f) * 0.5f);
+            while ((i + 1) * (i + 4) / 2 <= e)
+                ++i;
+            while (i * (i + 3) / 2 > e)
+                --i;
+            const int j = e - i * (i + 3) / 2 - 1;
             float sum = i == j ? 1.0f / masses[coupled[i]] : 0.0f;
-            for (int k = 0; k < DOFS; ++k)
-                sum += V[k * n + i] * along[k * 7 + 6] * (j < 0 ? push[k] : V[k * n + j]);
+            for (int side = 0; side < 2; ++side) {
+                const int body = ends[i][side];
+                const int from = stops.data[body] + (side ? ends[i][2] : 0);
+                const int to = stops.data[body + 1];
+                for (int x = from; x < to; ++x) {
+                    const int k = paths.data[x];
+                    sum += V[k * n + i] * along[k * 7 + 6] * (j < 0 ? push[k] : V[k * n + j]);
+                }
+            }
             if (j < 0)
                 z[i] = sum;
             else
@@ -298,11 +345,13 @@ _COUPLING = """
         WP_TILE_SYNC();
         for (int p = 0; p < n; ++p) {
             const float pivot = 1.0f / K[ROW(p) + p];
-            for (int i = p + 1 + lane; i < n; i += lanes) {
-                const float share = K[ROW(i) + p] * pivot;
-                for (int j = p + 1; j <= i; ++j)
-                    K[ROW(i) + j] -= share * K[ROW(j) + p];
-                z[i] -= share * z[p];
+            const int left = n - 1 - p;
+            for (int e = lane; e < left * (left + 1); e += lanes) {
+                const int i = p + 1 + e / (left + 1), j = p + e % (left + 1);
+                if (j == p)
+                    z[i] -= K[ROW(i) + p] * pivot * z[p];
+                else if (j <= i)
+                    K[ROW(i) + j] -= K[ROW(i) + p] * pivot * K[ROW(j) + p];
             }
             WP_TILE_SYNC();
         }
@@ -359,11 +408,16 @@ class Trees:
     """(L + 1,) first row of each level."""
     where: wp.array
     """(G,) row of the body of each geom; -1 where it does not move."""
+    stops: wp.array
+    """(B + 1,) where the path of each body begins in ``paths``."""
+    paths: wp.array
+    """Degrees of freedom from the root to a body, of one body after the other."""
     diagonal: wp.array
     """(nv,) where M keeps its diagonal."""
     bodies: int
     dofs: int
     lanes: int
+    """Threads of a block: no fewer than the bodies of a level."""
     whole: bool
     """Newton's direction is found here too: all constraints are limits of joints and contacts with
     a pyramid for friction."""
@@ -380,10 +434,10 @@ class Trees:
         """``(M + B) x = y``, B the diagonal by which ``damped`` is more than ``d.M``."""
         wp.launch(
             _solve_kernel(self.bodies, self.dofs),
-            dim=(d.nworld, self._block()),
+            dim=(d.nworld, _block(self.lanes)),
             inputs=[*self._inertias(m, d), d.M, damped, y],
             outputs=[x],
-            block_dim=self._block(),
+            block_dim=_block(self.lanes),
         )
 
     def direction(self, m: Any, d: Any, ctx: Any, again: bool) -> None:
@@ -392,7 +446,7 @@ class Trees:
         contact, rows = d.contact, d.efc
         wp.launch(
             _newton_kernel(self.bodies, self.dofs),
-            dim=(d.nworld, self._block()),
+            dim=(d.nworld, _block(max(self.lanes, COUPLERS))),
             inputs=[
                 ctx.done,
                 ctx.state_changed_count if again else d.nefc,
@@ -402,6 +456,8 @@ class Trees:
                 d.M,
                 ctx.grad,
                 self.where,
+                self.stops,
+                self.paths,
                 d.subtree_com,
                 d.nefc,
                 d.njmax,
@@ -419,15 +475,16 @@ class Trees:
                 contact.efc_address,
             ],
             outputs=[self.scratch, ctx.search, ctx.search_dot, ctx.newton_decrement],
-            block_dim=self._block(),
+            block_dim=_block(max(self.lanes, COUPLERS)),
         )
 
     def _inertias(self, m: Any, d: Any) -> list[Any]:
         tables = [self.table, self.begin, self.levels, self.diagonal]
         return [*tables, d.cinert, d.cdof, m.dof_armature]
 
-    def _block(self) -> int:
-        return self.lanes if wp.get_device().is_cuda else 1
+
+def _block(lanes: int) -> int:
+    return lanes if wp.get_device().is_cuda else 1
 
 
 def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
@@ -457,6 +514,9 @@ def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
             min(children, default=0),
             len(children),
         )
+    paths: list[list[int]] = []
+    for _, up, _, dof, dofs, _, _ in table.tolist():
+        paths.append((paths[up] if up >= 0 else []) + list(range(dof, dof + dofs)))
     contacts_known = (
         model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
         and model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
@@ -469,6 +529,8 @@ def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
         table=wp.array(table.reshape(-1), dtype=int),
         begin=wp.array(np.array(begin, dtype=np.int32), dtype=int),
         where=wp.array(row[np.asarray(model.geom_bodyid)].astype(np.int32), dtype=int),
+        stops=wp.array(np.cumsum([0, *map(len, paths)]).astype(np.int32), dtype=int),
+        paths=wp.array(np.array([k for path in paths for k in path], dtype=np.int32), dtype=int),
         diagonal=wp.array(
             (np.asarray(model.M_rowadr) + np.asarray(model.M_rownnz) - 1).astype(np.int32),
             dtype=int,
@@ -553,6 +615,8 @@ def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
         damped: wp.array2d(dtype=float),  # type: ignore[valid-type]
         right: wp.array2d(dtype=float),  # type: ignore[valid-type]
         where: wp.array(dtype=int),  # type: ignore[valid-type]
+        stops: wp.array(dtype=int),  # type: ignore[valid-type]
+        paths: wp.array(dtype=int),  # type: ignore[valid-type]
         centre: wp.array2d(dtype=wp.vec3),  # type: ignore[valid-type]
         number: wp.array(dtype=int),  # type: ignore[valid-type]
         most: int,
@@ -590,6 +654,8 @@ def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
         damped: wp.array2d(dtype=float),  # type: ignore[valid-type]
         right: wp.array2d(dtype=float),  # type: ignore[valid-type]
         where: wp.array(dtype=int),  # type: ignore[valid-type]
+        stops: wp.array(dtype=int),  # type: ignore[valid-type]
+        paths: wp.array(dtype=int),  # type: ignore[valid-type]
         centre: wp.array2d(dtype=wp.vec3),  # type: ignore[valid-type]
         number: wp.array(dtype=int),  # type: ignore[valid-type]
         most: int,
@@ -616,8 +682,9 @@ def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
         lanes = wp.block_dim()
         solve_trees(
             w, lane, lanes, table, begin, levels, diagonal, inertia, axis, armature, bare, damped,
-            right, where, centre, number, most, state, kind, id, mass, start, column, entries,
-            pairs, points, frames, friction, address, scratch, solution, squares, decrements,
+            right, where, stops, paths, centre, number, most, state, kind, id, mass, start, column,
+            entries, pairs, points, frames, friction, address, scratch, solution, squares,
+            decrements,
         )  # fmt: skip
 
     return newton_direction

@@ -20,7 +20,7 @@ from sports.physics.warp import WarpPhysics
 from sports.physics.warp_pieces import TILE, faster, find_tiles
 from sports.physics.warp_tree import trees
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(),
+DEVICES = ["cpu", pytest.param("cuda:0", marks=pytest.mark.skipif(not torch.cuda.is_available(),
                                                                reason="needs a GPU"))]  # fmt: skip
 
 
