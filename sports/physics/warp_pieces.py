@@ -29,7 +29,7 @@ from functools import cache
 from typing import Any
 
 import warp as wp
-from mujoco_warp._src import collision_convex, passive, smooth, solver, types
+from mujoco_warp._src import collision_convex, derivative, passive, smooth, solver, support, types
 
 from sports.physics.warp_tree import Trees
 
@@ -141,7 +141,9 @@ def solve_direction(
 
 _their_direction = solver._cholesky_factorize_solve
 _their_context = solver._create_solver_context
-_their_passive = passive.passive
+_their_passive, _their_multiply = passive.passive, support.mul_m
+_their_inertia, _their_transmission = smooth.crb, smooth.transmission
+_their_derivative = derivative.deriv_smooth_vel
 
 
 def _context(m: Any, d: Any, inplace_cholesky: bool = False) -> Any:
@@ -183,6 +185,18 @@ def _passive(m: Any, d: Any) -> None:
     _their_passive(few, d)
 
 
+@wp.kernel(enable_backward=False)
+def _joint_lengths(
+    joint: wp.array(dtype=wp.vec2i),  # type: ignore[valid-type]
+    coordinate: wp.array(dtype=int),  # type: ignore[valid-type]
+    gear: wp.array2d(dtype=wp.spatial_vector),  # type: ignore[valid-type]
+    qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    length: wp.array2d(dtype=float),  # type: ignore[valid-type]
+):
+    w, a = wp.tid()
+    length[w, a] = qpos[w, coordinate[joint[a][0]]] * gear[w % gear.shape[0], a][0]
+
+
 @contextmanager
 def faster(own: Trees) -> Iterator[None]:
     """MuJoCo Warp works with the pieces of this module inside the block."""
@@ -201,11 +215,42 @@ def faster(own: Trees) -> Iterator[None]:
     def factor_solve(m: Any, d: Any, M: wp.array, L: Any, D: Any, x: wp.array, y: wp.array) -> None:
         own.solve(m, d, M, x, y)
 
+    def multiply(
+        m: Any, d: Any, res: wp.array, vec: wp.array, skip: Any = None, M: Any = None
+    ) -> None:
+        if M is None:
+            own.multiply(m, d, res, vec, wp.empty(0, dtype=bool) if skip is None else skip)
+        else:
+            _their_multiply(m, d, res, vec, skip, M)
+
+    def inertia(m: Any, d: Any) -> None:
+        few = copy(m)
+        few.dof_parentid = own.above
+        _their_inertia(few, d)
+
+    def derivative_of_forces(m: Any, d: Any, out: wp.array) -> None:
+        few = copy(m)
+        few.M_fullm_i = few.M_fullm_j = own.each
+        _their_derivative(few, d, out)
+
+    def transmission(m: Any, d: Any) -> None:
+        if not own.geared:  # moments stay as they are
+            _their_transmission(m, d)
+            own.geared.append(True)
+            return
+        wp.launch(
+            _joint_lengths,
+            dim=(d.nworld, m.nactuator),
+            inputs=[m.actuator_trnid, m.jnt_qposadr, m.actuator_gear, d.qpos],
+            outputs=[d.actuator_length],
+        )
+
     here: list[tuple[Any, str, Any]] = [
         (collision_convex, "MJ_MAX_EPAHORIZON", max(collision_convex.MJ_MAX_EPAHORIZON, EDGES)),
         (smooth, "factor_m", lambda m, d: None),
         (smooth, "solve_m", solve_m),
         (smooth, "factor_solve_i", factor_solve),
+        (support, "mul_m", multiply),
         (solver, "_cholesky_factorize_solve", solve_direction),
     ]
     if own.whole:
@@ -214,8 +259,13 @@ def faster(own: Trees) -> Iterator[None]:
             (solver, "_update_gradient", update_gradient),
             (solver, "_update_gradient_incremental", update_again),
         ]
-    if own.plain:
-        here.append((passive, "passive", _passive))
+    if own.whole and own.plain:
+        here += [
+            (passive, "passive", _passive),
+            (smooth, "crb", inertia),
+            (smooth, "transmission", transmission),
+            (derivative, "deriv_smooth_vel", derivative_of_forces),
+        ]
     theirs = [(module, name, getattr(module, name)) for module, name, _ in here]
     try:
         for module, name, value in here:

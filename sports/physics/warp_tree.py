@@ -189,6 +189,62 @@ $output
 #undef ROW
 """
 
+_MULTIPLY = """
+#if defined(__CUDA_ARCH__)
+    __shared__ float slot[BODIES * 6];  // of a body: acceleration, then force
+#else
+    float slot[BODIES * 6];
+#endif
+    const size_t world = w;
+    const float* inertias = (const float*)((const char*)inertia.data + world * inertia.strides[0]);
+    const float* axes = (const float*)((const char*)axis.data + world * axis.strides[0]);
+    const float* given = (const float*)((const char*)factor.data + world * factor.strides[0]);
+    const float* rotors = (const float*)((const char*)armature.data
+        + (world % armature.shape[0]) * armature.strides[0]);
+    float* result = (float*)((char*)product.data + world * product.strides[0]);
+    const int* rows = table.data;
+    for (int level = 0; level < levels; ++level) {
+        for (int i = begin.data[level] + lane; i < begin.data[level + 1]; i += lanes) {
+            const int* row = rows + 7 * i;
+            float A[6];
+            for (int e = 0; e < 6; ++e)
+                A[e] = row[1] < 0 ? 0.0f : slot[row[1] * 6 + e];
+            for (int k = row[3]; k < row[3] + row[4]; ++k)
+                for (int e = 0; e < 6; ++e)
+                    A[e] += axes[6 * k + e] * given[k];
+            for (int e = 0; e < 6; ++e)
+                slot[i * 6 + e] = A[e];
+        }
+        WP_TILE_SYNC();
+    }
+    for (int level = levels - 1; level >= 0; --level) {
+        for (int i = begin.data[level] + lane; i < begin.data[level + 1]; i += lanes) {
+            const int* row = rows + 7 * i;
+            const float* I = inertias + 10 * row[0];
+            const float* A = slot + i * 6;
+            float F[6];
+            F[0] = I[0] * A[0] + I[3] * A[1] + I[4] * A[2] - I[8] * A[4] + I[7] * A[5];
+            F[1] = I[3] * A[0] + I[1] * A[1] + I[5] * A[2] + I[8] * A[3] - I[6] * A[5];
+            F[2] = I[4] * A[0] + I[5] * A[1] + I[2] * A[2] - I[7] * A[3] + I[6] * A[4];
+            F[3] = I[8] * A[1] - I[7] * A[2] + I[9] * A[3];
+            F[4] = I[6] * A[2] - I[8] * A[0] + I[9] * A[4];
+            F[5] = I[7] * A[0] - I[6] * A[1] + I[9] * A[5];
+            for (int j = row[5]; j < row[5] + row[6]; ++j)
+                for (int e = 0; e < 6; ++e)
+                    F[e] += slot[j * 6 + e];
+            for (int k = row[3]; k < row[3] + row[4]; ++k) {
+                float sum = rotors[k] * given[k];
+                for (int e = 0; e < 6; ++e)
+                    sum += axes[6 * k + e] * F[e];
+                result[k] = sum;
+            }
+            for (int e = 0; e < 6; ++e)
+                slot[i * 6 + e] = F[e];
+        }
+        WP_TILE_SYNC();
+    }
+"""
+
 _CONSTRAINTS = """
     SHARED int coupled[COUPLED];
     SHARED int many;
@@ -414,6 +470,10 @@ class Trees:
     """Degrees of freedom from the root to a body, of one body after the other."""
     diagonal: wp.array
     """(nv,) where M keeps its diagonal."""
+    each: wp.array
+    """(nv,) all degrees of freedom."""
+    above: wp.array
+    """(nv,) parents of the degrees of freedom of trees of one body; -1 for the others."""
     bodies: int
     dofs: int
     lanes: int
@@ -422,7 +482,10 @@ class Trees:
     """Newton's direction is found here too: all constraints are limits of joints and contacts with
     a pyramid for friction."""
     plain: bool
-    """Gravity acts on all bodies in full (no ``gravcomp``), and nothing else on their motion."""
+    """Gravity acts on all bodies in full (no ``gravcomp``) and no fluid; servos are one for each
+    joint that they drive."""
+    geared: list[bool]
+    """Not empty once the engine knows the servos' moments, which never change."""
     scratch: wp.array
     """(N, nv COUPLED) where each world notes its coupled rows."""
 
@@ -438,6 +501,18 @@ class Trees:
             inputs=[*self._inertias(m, d), d.M, damped, y],
             outputs=[x],
             block_dim=_block(self.lanes),
+        )
+
+    def multiply(self, m: Any, d: Any, y: wp.array, x: wp.array, skip: wp.array) -> None:
+        """``y = M x`` in the worlds that do not ``skip``."""
+        lanes = _block(self.lanes)
+        tables = [self.table, self.begin, self.levels]
+        wp.launch(
+            _multiply_kernel(self.bodies),
+            dim=(d.nworld, lanes),
+            inputs=[skip, *tables, d.cinert, d.cdof, m.dof_armature, x],
+            outputs=[y],
+            block_dim=lanes,
         )
 
     def direction(self, m: Any, d: Any, ctx: Any, again: bool) -> None:
@@ -524,6 +599,9 @@ def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
         and not (model.neq or model.ntendon or model.nflex)
         and not np.any(np.asarray(model.dof_frictionloss))
     )
+    driven = np.asarray(model.jnt_type)[np.asarray(model.actuator_trnid)[:, 0]]
+    members = np.bincount(np.asarray(model.body_treeid)[moving], minlength=model.ntree)
+    alone = members[np.asarray(model.dof_treeid)] == 1
     width = int(np.diff(begin).max())
     return Trees(
         table=wp.array(table.reshape(-1), dtype=int),
@@ -535,6 +613,8 @@ def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
             (np.asarray(model.M_rowadr) + np.asarray(model.M_rownnz) - 1).astype(np.int32),
             dtype=int,
         ),
+        each=wp.array(np.arange(model.nv, dtype=np.int32), dtype=int),
+        above=wp.array(np.where(alone, model.dof_parentid, -1).astype(np.int32), dtype=int),
         bodies=len(order),
         dofs=model.nv,
         lanes=32 * -(-width // 32),
@@ -544,7 +624,11 @@ def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
             or model.opt.density
             or model.opt.viscosity
             or model.nflex
+            or model.ntendon
+            or np.any(np.asarray(model.actuator_trntype) != int(mujoco.mjtTrn.mjTRN_JOINT))
+            or np.any(driven < int(mujoco.mjtJoint.mjJNT_SLIDE))
         ),
+        geared=[],
         scratch=wp.empty((num_worlds, model.nv * COUPLED if contacts_known else 0), dtype=float),
     )
 
@@ -593,6 +677,49 @@ def _solve_kernel(bodies: int, dofs: int) -> wp.Kernel:
         )  # fmt: skip
 
     return tree_solution
+
+
+@cache
+def _multiply_kernel(bodies: int) -> wp.Kernel:
+    """``M x``; the length of ``skip`` may be 0."""
+
+    @wp.func_native(snippet=_fill(_MULTIPLY, {"BODIES": bodies}))
+    def multiply_trees(
+        w: int,
+        lane: int,
+        lanes: int,
+        table: wp.array(dtype=int),  # type: ignore[valid-type]
+        begin: wp.array(dtype=int),  # type: ignore[valid-type]
+        levels: int,
+        inertia: wp.array2d(dtype=types.vec10),  # type: ignore[valid-type]
+        axis: wp.array2d(dtype=wp.spatial_vector),  # type: ignore[valid-type]
+        armature: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        factor: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        product: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    ): ...
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def tree_product(
+        skip: wp.array(dtype=bool),  # type: ignore[valid-type]
+        table: wp.array(dtype=int),  # type: ignore[valid-type]
+        begin: wp.array(dtype=int),  # type: ignore[valid-type]
+        levels: int,
+        inertia: wp.array2d(dtype=types.vec10),  # type: ignore[valid-type]
+        axis: wp.array2d(dtype=wp.spatial_vector),  # type: ignore[valid-type]
+        armature: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        factor: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        product: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    ):
+        w, lane = wp.tid()
+        if skip.shape[0] > 0:
+            if skip[w]:
+                return
+        lanes = wp.block_dim()
+        multiply_trees(
+            w, lane, lanes, table, begin, levels, inertia, axis, armature, factor, product
+        )
+
+    return tree_product
 
 
 @cache
@@ -705,4 +832,9 @@ def _text(bodies: int, dofs: int, newton: bool = False) -> str:
         "LIMIT": int(types.ConstraintType.LIMIT_JOINT),
         "PYRAMID": int(types.ConstraintType.CONTACT_PYRAMIDAL),
     }
+    return _fill(text, names)
+
+
+def _fill(text: str, names: dict[str, int]) -> str:
+    """The text with numbers in the place of names."""
     return re.sub("|".join(rf"\b{name}\b" for name in names), lambda f: str(names[f[0]]), text)
