@@ -39,9 +39,10 @@ from mujoco_warp._src import types
 
 COUPLED = 44
 """Rows of contacts between two bodies that move that a world solves exactly."""
-COUPLERS = 128
-"""Threads of a block for Newton's direction: few of the worlds that iterate to the end are not
-coupled, and what couples them has more to do side by side than a level of a tree."""
+FIRST, AGAIN = 64, 128
+"""Threads of a block for Newton's direction, in the first iteration and in later ones: few of the
+worlds that iterate on are not coupled, and what couples them has more to do side by side than a
+level of a tree."""
 
 _COLUMNS = ("body", "parent", "root", "dof", "dofs", "child", "children")
 """Of the table of bodies: the body's own number; its parent's row (-1: none); the root's number;
@@ -519,9 +520,10 @@ class Trees:
         """Newton's direction at the gradient ``ctx.grad``; ``again``: only of worlds in which a
         constraint's state has changed."""
         contact, rows = d.contact, d.efc
+        lanes = _block(max(self.lanes, AGAIN if again else FIRST))
         wp.launch(
             _newton_kernel(self.bodies, self.dofs),
-            dim=(d.nworld, _block(max(self.lanes, COUPLERS))),
+            dim=(d.nworld, lanes),
             inputs=[
                 ctx.done,
                 ctx.state_changed_count if again else d.nefc,
@@ -550,7 +552,7 @@ class Trees:
                 contact.efc_address,
             ],
             outputs=[self.scratch, ctx.search, ctx.search_dot, ctx.newton_decrement],
-            block_dim=_block(max(self.lanes, COUPLERS)),
+            block_dim=lanes,
         )
 
     def _inertias(self, m: Any, d: Any) -> list[Any]:
