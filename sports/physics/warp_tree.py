@@ -39,10 +39,13 @@ from mujoco_warp._src import types
 
 COUPLED = 44
 """Rows of contacts between two bodies that move that a world solves exactly."""
-FIRST, AGAIN = 64, 128
-"""Threads of a block for Newton's direction, in the first iteration and in later ones: few of the
-worlds that iterate on are not coupled, and what couples them has more to do side by side than a
-level of a tree."""
+AGAIN = 128
+"""Threads of a block for Newton's direction, but in the first iteration: few of the worlds that
+iterate on are not coupled, and what couples them has more to do side by side than a level of a
+tree."""
+CREW = 200
+"""Degrees of freedom for each 32 threads of the first iteration, for which most worlds have little
+to do."""
 
 _COLUMNS = ("body", "parent", "root", "dof", "dofs", "child", "children")
 """Of the table of bodies: the body's own number; its parent's row (-1: none); the root's number;
@@ -520,7 +523,7 @@ class Trees:
         """Newton's direction at the gradient ``ctx.grad``; ``again``: only of worlds in which a
         constraint's state has changed."""
         contact, rows = d.contact, d.efc
-        lanes = _block(max(self.lanes, AGAIN if again else FIRST))
+        lanes = _block(max(self.lanes, AGAIN if again else 32 * -(-self.dofs // CREW)))
         wp.launch(
             _newton_kernel(self.bodies, self.dofs),
             dim=(d.nworld, lanes),
