@@ -7,8 +7,8 @@
 * With a round cone for friction it asks, of more than 96 degrees of freedom, which 16 x 16 tiles of
   the Hessian are zero, with half a million blocks of threads that mostly have nothing to do (13 %
   of a control step of SMPL-X). Here a block takes a world.
-* What lifts bodies against gravity is asked of each body for each degree of freedom, even where
-  nothing does. Here it is not.
+* Nothing is computed that nobody asks for: the inertia's entries beside its diagonal, what lifts
+  bodies against gravity where nothing does, and the servos' moments, which never change.
 * Where a cylinder (a racket) is deep in a box (a hand, a foot), the search for the depth has room
   for 24 edges of a polytope's horizon, and gives up with an overflow in one of 8000 random poses
   that overlap; its world is reset for it. Here there is room for ``EDGES``. Three of twelve such
@@ -234,9 +234,9 @@ def faster(own: Trees) -> Iterator[None]:
         _their_derivative(few, d, out)
 
     def transmission(m: Any, d: Any) -> None:
-        if not own.geared:  # moments stay as they are
+        if not any(known is d for known in own.geared):
             _their_transmission(m, d)
-            own.geared.append(True)
+            own.geared.append(d)
             return
         wp.launch(
             _joint_lengths,
@@ -247,24 +247,24 @@ def faster(own: Trees) -> Iterator[None]:
 
     here: list[tuple[Any, str, Any]] = [
         (collision_convex, "MJ_MAX_EPAHORIZON", max(collision_convex.MJ_MAX_EPAHORIZON, EDGES)),
-        (smooth, "factor_m", lambda m, d: None),
-        (smooth, "solve_m", solve_m),
-        (smooth, "factor_solve_i", factor_solve),
-        (support, "mul_m", multiply),
         (solver, "_cholesky_factorize_solve", solve_direction),
     ]
-    if own.whole:
+    if own.plain:
         here += [
+            (smooth, "factor_m", lambda m, d: None),
+            (smooth, "solve_m", solve_m),
+            (smooth, "factor_solve_i", factor_solve),
+            (smooth, "transmission", transmission),
+            (support, "mul_m", multiply),
+            (passive, "passive", _passive),
+            (derivative, "deriv_smooth_vel", derivative_of_forces),
+        ]
+    if own.plain and own.whole:  # nobody asks for the rest of M
+        here += [
+            (smooth, "crb", inertia),
             (solver, "_create_solver_context", _context),
             (solver, "_update_gradient", update_gradient),
             (solver, "_update_gradient_incremental", update_again),
-        ]
-    if own.whole and own.plain:
-        here += [
-            (passive, "passive", _passive),
-            (smooth, "crb", inertia),
-            (smooth, "transmission", transmission),
-            (derivative, "deriv_smooth_vel", derivative_of_forces),
         ]
     theirs = [(module, name, getattr(module, name)) for module, name, _ in here]
     try:

@@ -15,13 +15,13 @@ What B holds of constraints:
 * a joint's limit adds D to the joint's diagonal;
 * a contact with something that does not move pushes one body along a wrench W for each edge of the
   friction pyramid, and D W W^T is added to that body's inertia;
-* a contact of two bodies that both move couples them. Rows j_i of these are solved apart:
-  with L^T D L = M + B and u_i = L^-T j_i, which is not zero but along the paths from both
-  bodies to their roots,
-  (1/D + u^T D^-1 u) z = u^T D^-1 u_b tells what to take off (Woodbury's formula; the small matrix
-  is well conditioned, as 1/D is a share of what it is added to).
-  Of more than ``COUPLED`` such rows in a world, the others are put on both bodies' inertias
-  with twice their D, which is no less than what they are: Newton's direction still descends.
+* a contact of two bodies that both move couples them. Its rows j are solved apart: let the rest be
+  L^T P L with pivots P, and u = L^-T j, which is zero but along the paths from both bodies to their
+  roots; then (1/D + u^T P^-1 u) z = u^T P^-1 L^-T b, and what is left to solve has L^-T b - u z in
+  the place of L^-T b (Woodbury's formula; the small matrix is well conditioned, as 1/D is a share
+  of what it is added to). Of more than ``COUPLED`` such rows in a world, the others are put on both
+  bodies' inertias with twice their D, which is no less than what they are: Newton's direction still
+  descends.
 """
 
 from __future__ import annotations
@@ -486,10 +486,10 @@ class Trees:
     """Newton's direction is found here too: all constraints are limits of joints and contacts with
     a pyramid for friction."""
     plain: bool
-    """Gravity acts on all bodies in full (no ``gravcomp``) and no fluid; servos are one for each
-    joint that they drive."""
-    geared: list[bool]
-    """Not empty once the engine knows the servos' moments, which never change."""
+    """Nothing but the joints' own armature, damping and servos is on M's and the integrator's
+    diagonals, and nothing lifts bodies: all is solved here."""
+    geared: list[Any]
+    """Data that know the servos' moments, which never change."""
     scratch: wp.array
     """(N, nv COUPLED) where each world notes its coupled rows."""
 
@@ -630,6 +630,7 @@ def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
             or model.opt.viscosity
             or model.nflex
             or model.ntendon
+            or np.any(np.asarray(model.actuator_armature))
             or np.any(np.asarray(model.actuator_trntype) != int(mujoco.mjtTrn.mjTRN_JOINT))
             or np.any(driven < int(mujoco.mjtJoint.mjJNT_SLIDE))
         ),
