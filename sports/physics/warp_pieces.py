@@ -160,23 +160,6 @@ def _context(m: Any, d: Any, inplace_cholesky: bool = False) -> Any:
     return ctx
 
 
-def _gradient(m: Any, d: Any, ctx: Any, again: bool) -> None:
-    """The gradient; ``again``: of worlds in which a constraint's state has changed."""
-    changed = ctx.state_changed_count if again else d.nefc
-    wp.launch(
-        solver._update_gradient_zero_grad_dot(again),
-        dim=d.nworld,
-        inputs=[changed, ctx.alpha, ctx.done],
-        outputs=[ctx.grad_dot, ctx.newton_decrement, ctx.grad_scale, ctx.search_unchanged],
-    )
-    wp.launch(
-        solver._update_gradient_grad(again),
-        dim=(d.nworld, m.nv),
-        inputs=[d.qfrc_smooth, d.qfrc_constraint, d.efc.Ma, changed, ctx.done],
-        outputs=[ctx.grad, ctx.grad_dot],
-    )
-
-
 def _passive(m: Any, d: Any) -> None:
     """In place of ``passive.passive`` where gravity acts on all bodies: it would ask each for its
     share of each degree of freedom (two by two athletes with fingers: 135 thousand a world)."""
@@ -202,11 +185,9 @@ def faster(own: Trees) -> Iterator[None]:
     """MuJoCo Warp works with the pieces of this module inside the block."""
 
     def update_gradient(m: Any, d: Any, ctx: Any, compact: bool = False) -> None:
-        _gradient(m, d, ctx, False)
         own.direction(m, d, ctx, False)
 
     def update_again(m: Any, d: Any, ctx: Any, stable_fast: bool = False) -> None:
-        _gradient(m, d, ctx, stable_fast)
         own.direction(m, d, ctx, stable_fast)
 
     def solve_m(m: Any, d: Any, x: wp.array, y: wp.array, x_scratch: Any = None) -> None:

@@ -69,7 +69,6 @@ _SOLVE = """
     const size_t world = w;
     const float* inertias = (const float*)((const char*)inertia.data + world * inertia.strides[0]);
     const float* axes = (const float*)((const char*)axis.data + world * axis.strides[0]);
-    const float* wanted = (const float*)((const char*)right.data + world * right.strides[0]);
     const float* rotors = (const float*)((const char*)armature.data
         + (world % armature.shape[0]) * armature.strides[0]);
     const float* before = (const float*)((const char*)bare.data + world * bare.strides[0]);
@@ -80,7 +79,7 @@ _SOLVE = """
     for (int k = lane; k < DOFS; k += lanes) {
         const int entry = diagonal.data[k];
         along[k * 7 + 6] = rotors[k] + (after[entry] - before[entry]);
-        push[k] = wanted[k];
+        $right
     }
 $constraints
     for (int level = levels - 1; level >= 0; --level) {
@@ -252,10 +251,10 @@ _MULTIPLY = """
 _CONSTRAINTS = """
     SHARED int coupled[COUPLED];
     SHARED int many;
-    SHARED float sums[2];
+    SHARED float sums[3];
     if (lane == 0) {
         many = 0;
-        sums[0] = sums[1] = 0.0f;
+        sums[0] = sums[1] = sums[2] = 0.0f;
     }
     WP_TILE_SYNC();
     const int* states = (const int*)((const char*)state.data + world * state.strides[0]);
@@ -434,25 +433,38 @@ _COUPLING = """
     }
 """
 
+_PLAIN_RIGHT = "push[k] = ((const float*)((const char*)right.data + world * right.strides[0]))[k];"
+
+_NEWTON_RIGHT = """
+        const float g = ((const float*)((const char*)moved.data + world * moved.strides[0]))[k]
+            - ((const float*)((const char*)smooth.data + world * smooth.strides[0]))[k]
+            - ((const float*)((const char*)held.data + world * held.strides[0]))[k];
+        ((float*)((char*)gradient.data + world * gradient.strides[0]))[k] = push[k] = g;
+"""
+
 _PLAIN_OUTPUT = """
     for (int k = lane; k < DOFS; k += lanes)
         result[k] = push[k];
 """
 
 _NEWTON_OUTPUT = """
-    float square = 0.0f, decrement = 0.0f;
+    const float* slope = (const float*)((const char*)gradient.data + world * gradient.strides[0]);
+    float square = 0.0f, decrement = 0.0f, steepness = 0.0f;
     for (int k = lane; k < DOFS; k += lanes) {
-        const float x = push[k];
+        const float x = push[k], g = slope[k];
         result[k] = -x;
         square += x * x;
-        decrement += x * wanted[k];
+        decrement += x * g;
+        steepness += g * g;
     }
     ADD(sums[0], square);
     ADD(sums[1], decrement);
+    ADD(sums[2], steepness);
     WP_TILE_SYNC();
     if (lane == 0) {
         squares.data[world] = sums[0];
         decrements.data[world] = sums[1];
+        steepnesses.data[world] = sums[2];
     }
 """
 
@@ -520,8 +532,8 @@ class Trees:
         )
 
     def direction(self, m: Any, d: Any, ctx: Any, again: bool) -> None:
-        """Newton's direction at the gradient ``ctx.grad``; ``again``: only of worlds in which a
-        constraint's state has changed."""
+        """The gradient of the cost and Newton's direction; ``again``: after the step ``ctx.alpha``
+        along the one before, and anew only in worlds in which a constraint's state has changed."""
         contact, rows = d.contact, d.efc
         lanes = _block(max(self.lanes, AGAIN if again else 32 * -(-self.dofs // CREW)))
         wp.launch(
@@ -531,10 +543,13 @@ class Trees:
                 ctx.done,
                 ctx.state_changed_count if again else d.nefc,
                 again,
+                ctx.alpha,
                 *self._inertias(m, d),
                 d.M,
                 d.M,
-                ctx.grad,
+                rows.Ma,
+                d.qfrc_smooth,
+                d.qfrc_constraint,
                 self.where,
                 self.stops,
                 self.paths,
@@ -554,7 +569,16 @@ class Trees:
                 contact.friction,
                 contact.efc_address,
             ],
-            outputs=[self.scratch, ctx.search, ctx.search_dot, ctx.newton_decrement],
+            outputs=[
+                self.scratch,
+                ctx.grad,
+                ctx.search,
+                ctx.search_dot,
+                ctx.newton_decrement,
+                ctx.grad_dot,
+                ctx.grad_scale,
+                ctx.search_unchanged,
+            ],
             block_dim=lanes,
         )
 
@@ -730,7 +754,8 @@ def _multiply_kernel(bodies: int) -> wp.Kernel:
 
 @cache
 def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
-    """Newton's direction in every world that is not done and has ``changed``."""
+    """The gradient and Newton's direction in every world that is not done; ``again``: where
+    something has ``changed``."""
 
     @wp.func_native(snippet=_text(bodies, dofs, newton=True))
     def solve_trees(
@@ -746,7 +771,9 @@ def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
         armature: wp.array2d(dtype=float),  # type: ignore[valid-type]
         bare: wp.array2d(dtype=float),  # type: ignore[valid-type]
         damped: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        right: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        moved: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        smooth: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        held: wp.array2d(dtype=float),  # type: ignore[valid-type]
         where: wp.array(dtype=int),  # type: ignore[valid-type]
         stops: wp.array(dtype=int),  # type: ignore[valid-type]
         paths: wp.array(dtype=int),  # type: ignore[valid-type]
@@ -766,9 +793,11 @@ def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
         friction: wp.array(dtype=types.vec5),  # type: ignore[valid-type]
         address: wp.array2d(dtype=int),  # type: ignore[valid-type]
         scratch: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        gradient: wp.array2d(dtype=float),  # type: ignore[valid-type]
         solution: wp.array2d(dtype=float),  # type: ignore[valid-type]
         squares: wp.array(dtype=float),  # type: ignore[valid-type]
         decrements: wp.array(dtype=float),  # type: ignore[valid-type]
+        steepnesses: wp.array(dtype=float),  # type: ignore[valid-type]
     ): ...
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -776,6 +805,7 @@ def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
         done: wp.array(dtype=bool),  # type: ignore[valid-type]
         changed: wp.array(dtype=int),  # type: ignore[valid-type]
         again: bool,
+        step: wp.array(dtype=float),  # type: ignore[valid-type]
         table: wp.array(dtype=int),  # type: ignore[valid-type]
         begin: wp.array(dtype=int),  # type: ignore[valid-type]
         levels: int,
@@ -785,7 +815,9 @@ def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
         armature: wp.array2d(dtype=float),  # type: ignore[valid-type]
         bare: wp.array2d(dtype=float),  # type: ignore[valid-type]
         damped: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        right: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        moved: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        smooth: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        held: wp.array2d(dtype=float),  # type: ignore[valid-type]
         where: wp.array(dtype=int),  # type: ignore[valid-type]
         stops: wp.array(dtype=int),  # type: ignore[valid-type]
         paths: wp.array(dtype=int),  # type: ignore[valid-type]
@@ -805,19 +837,39 @@ def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
         friction: wp.array(dtype=types.vec5),  # type: ignore[valid-type]
         address: wp.array2d(dtype=int),  # type: ignore[valid-type]
         scratch: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        gradient: wp.array2d(dtype=float),  # type: ignore[valid-type]
         solution: wp.array2d(dtype=float),  # type: ignore[valid-type]
         squares: wp.array(dtype=float),  # type: ignore[valid-type]
         decrements: wp.array(dtype=float),  # type: ignore[valid-type]
+        steepnesses: wp.array(dtype=float),  # type: ignore[valid-type]
+        scales: wp.array(dtype=float),  # type: ignore[valid-type]
+        unchanged: wp.array(dtype=bool),  # type: ignore[valid-type]
     ):
         w, lane = wp.tid()
-        if done[w] or (again and changed[w] == 0):
+        same = again and changed[w] == 0
+        if lane == 0:
+            unchanged[w] = same or (again and done[w])
+        if done[w]:
             return
+        if same:
+            # The cost was a parabola along the whole step: the gradient is as it was but for its
+            # length, of which the step took its share, and so is the direction.
+            if lane == 0:
+                scale = scales[w]
+                left = scale - step[w]
+                share = wp.where(scale != 0.0, left / scale, 0.0)
+                decrements[w] = decrements[w] * share * share
+                steepnesses[w] = steepnesses[w] * share * share
+                scales[w] = left
+            return
+        if lane == 0:
+            scales[w] = 1.0
         lanes = wp.block_dim()
         solve_trees(
             w, lane, lanes, table, begin, levels, diagonal, inertia, axis, armature, bare, damped,
-            right, where, stops, paths, centre, number, most, state, kind, id, mass, start, column,
-            entries, pairs, points, frames, friction, address, scratch, solution, squares,
-            decrements,
+            moved, smooth, held, where, stops, paths, centre, number, most, state, kind, id, mass,
+            start, column, entries, pairs, points, frames, friction, address, scratch, gradient,
+            solution, squares, decrements, steepnesses,
         )  # fmt: skip
 
     return newton_direction
@@ -828,6 +880,7 @@ def _text(bodies: int, dofs: int, newton: bool = False) -> str:
     text = Template(_SOLVE).substitute(
         constraints=_CONSTRAINTS if newton else "",
         coupling=_COUPLING if newton else "",
+        right=_NEWTON_RIGHT.strip() if newton else _PLAIN_RIGHT,
         output=_NEWTON_OUTPUT if newton else _PLAIN_OUTPUT,
     )
     names = {

@@ -100,19 +100,34 @@ def test_newton_s_direction(task: str, room: int, device: str, monkeypatch):
         counts, noise = d.nefc.numpy(), np.random.default_rng(0)
         state = noise.integers(0, 2, d.efc.state.shape).astype(np.int32)
         d.efc.state = wp.array(state, dtype=int)
-        gradient = noise.normal(size=(worlds, m.nv_pad)).astype(np.float32)
+        moved, smoothly, held = noise.normal(size=(3, worlds, nv)).astype(np.float32)
+        d.efc.Ma, d.qfrc_smooth, d.qfrc_constraint = (
+            wp.array(each, dtype=float) for each in (moved, smoothly, held)
+        )
+        gradient = moved - smoothly - held
         ctx = SimpleNamespace(
             done=wp.array([False, False, True], dtype=bool),
             state_changed_count=wp.array([1, 0, 1], dtype=int),
-            grad=wp.array(gradient, dtype=float),
+            alpha=wp.array([0.25, 0.25, 0.25], dtype=float),
+            grad=wp.full((worlds, nv), 5.0, dtype=float),
+            grad_dot=wp.full(worlds, 2.0, dtype=float),
+            grad_scale=wp.full(worlds, 0.5, dtype=float),
+            search_unchanged=wp.zeros(worlds, dtype=bool),
             search=wp.full((worlds, nv), 7.0, dtype=float),
             search_dot=wp.zeros(worlds, dtype=float),
-            newton_decrement=wp.zeros(worlds, dtype=float),
+            newton_decrement=wp.full(worlds, 4.0, dtype=float),
         )
         own.direction(m, d, ctx, True)
-        # Nothing changed there, or it is done: left as it was.
-        assert (ctx.search.numpy()[1:] == 7.0).all()
+        # Nothing changed there, or it is done: left as it was, but shorter by the step's share.
+        assert (ctx.search.numpy()[1:] == 7.0).all() and (ctx.grad.numpy()[1:] == 5.0).all()
+        assert ctx.search_unchanged.numpy().tolist() == [False, True, True]
+        assert ctx.grad_scale.numpy().tolist() == [1.0, 0.25, 0.5]
+        assert ctx.grad_dot.numpy()[1:].tolist() == [0.5, 2.0]
+        assert ctx.newton_decrement.numpy()[1:].tolist() == [1.0, 4.0]
         own.direction(m, d, ctx, False)
+        assert not ctx.search_unchanged.numpy().any()
+        assert np.allclose(ctx.grad.numpy()[:2], gradient[:2], atol=1e-6)
+        assert np.allclose(ctx.grad_dot.numpy()[:2], (gradient[:2] ** 2).sum(-1), rtol=1e-5)
         found = -ctx.search.numpy().astype(float)
     assert (found[2] == -7.0).all()
     J, rows = d.efc.J.numpy()[:, 0], d.efc
