@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from mujoco_warp._src import passive, smooth, solver, types
+from mujoco_warp._src import passive, smooth, solver, support, types
 
 from sports.env import make_scene
 from sports.humanoid.mjcf import build_model
@@ -61,11 +61,17 @@ def test_systems_with_the_inertia_are_solved(task: str, device: str):
         smooth.solve_m(m, d, x, y)
         bare = x.numpy().copy()
         smooth.factor_solve_i(m, d, damped, None, None, x, y)
+        product = wp.full((3, model.nv), 7.0, dtype=float)
+        support.mul_m(m, d, product, y, wp.array([False, True, False], dtype=bool))
+    assert (product.numpy()[1] == 7.0).all()  # told to skip it
     for world in range(3):
         data.qpos[:] = physics.qpos[world].cpu().numpy()
         mujoco.mj_forward(model, data)
         inertia = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, inertia)
+        if world != 1:
+            expected = inertia @ force.numpy()[world]
+            assert np.abs(product.numpy()[world] - expected).max() < 1e-4 * np.abs(expected).max()
         for found, more in ((bare, 0.0), (x.numpy(), damping[world].double().numpy())):
             expected = np.linalg.solve(
                 inertia + np.diag(more * np.ones(model.nv)), force.numpy()[world]
