@@ -47,6 +47,9 @@ CREW = 200
 """Degrees of freedom for each 32 threads of the first iteration, for which most worlds have little
 to do."""
 
+ROOM = 48 * 1024
+"""Bytes of shared memory that a block may have; two by two athletes with fingers take 47972."""
+
 _COLUMNS = ("body", "parent", "root", "dof", "dofs", "child", "children")
 """Of the table of bodies: the body's own number; its parent's row (-1: none); the root's number;
 first degree of freedom and their number; first child's row and their number."""
@@ -496,10 +499,10 @@ class Trees:
     """Threads of a block: no fewer than the bodies of a level."""
     whole: bool
     """Newton's direction is found here too: all constraints are limits of joints and contacts with
-    a pyramid for friction."""
+    a pyramid for friction, and a block has room for it."""
     plain: bool
     """Nothing but the joints' own armature, damping and servos is on M's and the integrator's
-    diagonals, and nothing lifts bodies: all is solved here."""
+    diagonals, nothing lifts bodies, and a block has room: all is solved here."""
     geared: list[Any]
     """Data that know the servos' moments, which never change."""
     scratch: wp.array
@@ -621,12 +624,15 @@ def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
     paths: list[list[int]] = []
     for _, up, _, dof, dofs, _, _ in table.tolist():
         paths.append((paths[up] if up >= 0 else []) + list(range(dof, dof + dofs)))
+    room = 4 * (27 * len(order) + 8 * model.nv)
+    room_of_rows = 4 * (COUPLED * (COUPLED + 1) // 2 + 5 * COUPLED + 4)
     contacts_known = (
         model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
         and model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
         and {*np.asarray(model.geom_condim), *np.asarray(model.pair_dim)} <= {1, 3}
         and not (model.neq or model.ntendon or model.nflex)
         and not np.any(np.asarray(model.dof_frictionloss))
+        and room + room_of_rows <= ROOM
     )
     driven = np.asarray(model.jnt_type)[np.asarray(model.actuator_trnid)[:, 0]]
     members = np.bincount(np.asarray(model.body_treeid)[moving], minlength=model.ntree)
@@ -657,6 +663,7 @@ def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
             or np.any(np.asarray(model.actuator_armature))
             or np.any(np.asarray(model.actuator_trntype) != int(mujoco.mjtTrn.mjTRN_JOINT))
             or np.any(driven < int(mujoco.mjtJoint.mjJNT_SLIDE))
+            or room > ROOM
         ),
         geared=[],
         scratch=wp.empty((num_worlds, model.nv * COUPLED if contacts_known else 0), dtype=float),

@@ -222,6 +222,20 @@ def test_the_library_is_as_before_outside_the_block():
     assert inner() == own
 
 
+def test_a_world_without_room_for_its_trees_keeps_the_library_s_own_pieces(monkeypatch):
+    model = build_model(make_scene("long_jump"))
+    theirs = smooth.solve_m, solver._update_gradient
+    with wp.ScopedDevice("cpu"):
+        monkeypatch.setattr(warp_tree, "ROOM", 4 * (27 * 24 + 8 * 75))  # for the inertia alone
+        own = trees(model, 1)
+        assert (own.bodies, own.dofs, own.plain, own.whole) == (24, 75, True, False)
+        with faster(own):
+            assert smooth.solve_m != theirs[0] and solver._update_gradient == theirs[1]
+        monkeypatch.setattr(warp_tree, "ROOM", 0)
+        with faster(trees(model, 1)):
+            assert (smooth.solve_m, solver._update_gradient) == theirs
+
+
 @pytest.mark.parametrize("task", ["long_jump", "javelin", "tennis_1v1", "basketball_1v1"])
 def test_a_step_is_the_same_with_the_library_s_own_pieces(task: str, monkeypatch):
     """Three flailing control steps of 4 worlds, to rounding of single precision."""
