@@ -16,7 +16,7 @@
   is more than 2 cm deep (float32). Fewer rounds of the search overflow less, but miss more: 16
   instead of 35, 4 in 1000.
 
-This module and ``warp_tree.py`` alone depend on MuJoCo Warp's inner names (4.0);
+This module and ``warp_tree*.py`` alone depend on MuJoCo Warp's inner names (4.0);
 ``tests/sports/test_warp_pieces.py`` says whether another version still has them.
 """
 
