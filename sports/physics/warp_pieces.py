@@ -218,7 +218,6 @@ def faster(own: Trees) -> Iterator[None]:
         if not any(known is d for known in own.geared):
             _their_transmission(m, d)
             own.geared.append(d)
-            return
         wp.launch(
             _joint_lengths,
             dim=(d.nworld, m.nactuator),
