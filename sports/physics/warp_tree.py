@@ -47,8 +47,8 @@ CREW = 200
 """Degrees of freedom for each 32 threads of the first iteration, for which most worlds have little
 to do."""
 
-ROOM = 48 * 1024
-"""Bytes of shared memory that a block may have; two by two athletes with fingers take 47972."""
+ROOM = 48 * 1024 - 512
+"""Bytes of shared memory that a block may have, less what Warp itself takes."""
 
 COLUMNS = ("body", "parent", "root", "dof", "dofs", "child", "children")
 """Of the table of bodies: the body's own number; its parent's row (-1: none); the root's number;
@@ -177,6 +177,12 @@ def _block(lanes: int) -> int:
     return lanes if wp.get_device().is_cuda else 1
 
 
+def room(bodies: int, dofs: int, coupled: int = 0) -> int:
+    """Bytes of shared memory that a world takes; two by two athletes with fingers 47972."""
+    rows = coupled * (coupled + 1) // 2 + 5 * coupled + 4 if coupled else 0
+    return 4 * (27 * bodies + 8 * dofs + rows)
+
+
 def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
     """Of a model, on Warp's current device."""
     parent, depth = np.asarray(model.body_parentid), np.zeros(model.nbody, dtype=int)
@@ -207,15 +213,13 @@ def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
     paths: list[list[int]] = []
     for _, up, _, dof, dofs, _, _ in table.tolist():
         paths.append((paths[up] if up >= 0 else []) + list(range(dof, dof + dofs)))
-    room = 4 * (27 * len(order) + 8 * model.nv)
-    room_of_rows = 4 * (COUPLED * (COUPLED + 1) // 2 + 5 * COUPLED + 4)
     contacts_known = (
         model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
         and model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
         and {*np.asarray(model.geom_condim), *np.asarray(model.pair_dim)} <= {1, 3}
         and not (model.neq or model.ntendon or model.nflex)
         and not np.any(np.asarray(model.dof_frictionloss))
-        and room + room_of_rows <= ROOM
+        and room(len(order), model.nv, COUPLED) <= ROOM
     )
     driven = np.asarray(model.jnt_type)[np.asarray(model.actuator_trnid)[:, 0]]
     members = np.bincount(np.asarray(model.body_treeid)[moving], minlength=model.ntree)
@@ -246,7 +250,7 @@ def trees(model: mujoco.MjModel, num_worlds: int) -> Trees:
             or np.any(np.asarray(model.actuator_armature))
             or np.any(np.asarray(model.actuator_trntype) != int(mujoco.mjtTrn.mjTRN_JOINT))
             or np.any(driven < int(mujoco.mjtJoint.mjJNT_SLIDE))
-            or room > ROOM
+            or room(len(order), model.nv) > ROOM
         ),
         geared=[],
         scratch=wp.empty((num_worlds, model.nv * COUPLED if contacts_known else 0), dtype=float),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -220,6 +222,30 @@ def test_the_library_is_as_before_outside_the_block():
         assert not set(inner()) & set(own)
         raise ZeroDivisionError
     assert inner() == own
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp knows no GPU there")
+def test_the_native_code_compiles_for_a_gpu_and_fits_it(tmp_path):
+    """Of the largest model, without a GPU, for an old one."""
+    with wp.ScopedDevice("cpu"):
+        own = trees(build_model(make_scene("basketball_2v2"), sensors=False), 1)
+    assert own.plain and own.whole
+    sizes = own.bodies, own.dofs
+    wanted = {
+        warp_tree._newton_kernel(*sizes): warp_tree.room(*sizes, warp_tree.COUPLED),
+        warp_tree._solve_kernel(*sizes): warp_tree.room(*sizes),
+        warp_tree._multiply_kernel(own.bodies): 4 * 6 * own.bodies,
+    }
+    declared = re.compile(r"\.shared\s+\.align \d+ \.([a-z])(\d+) \w+(?:\[(\d+)\])?;")
+    for kernel, size in wanted.items():
+        folder, before = tmp_path / kernel.key, dict(kernel.module.options)
+        kernel.module.options["block_dim"] = max(own.lanes, warp_tree.AGAIN)
+        wp.compile_aot_module(kernel.module, arch=75, module_dir=str(folder), use_ptx=True)
+        kernel.module.options.update(before)
+        (ptx,) = (path.read_text() for path in folder.iterdir() if path.suffix == ".ptx")
+        shared = sum(int(bits) // 8 * int(n or 1) for _, bits, n in declared.findall(ptx))
+        assert size <= shared <= 48 * 1024
+        assert shared - size in (0, 512)  # Warp's own
 
 
 def test_a_world_without_room_for_its_trees_keeps_the_library_s_own_pieces(monkeypatch):
