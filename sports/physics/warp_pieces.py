@@ -31,7 +31,7 @@ from typing import Any
 import warp as wp
 from mujoco_warp._src import collision_convex, derivative, passive, smooth, solver, support, types
 
-from sports.physics.warp_tree import Trees
+from sports.physics.warp_tree import Trees, block
 
 LANES = 128
 """Threads of a block that looks for tiles: four rows of 32."""
@@ -84,7 +84,7 @@ def tiles_kernel(skip_unchanged: bool, skip_noflip: bool) -> wp.Kernel:
 
 def find_tiles(m: Any, d: Any, ctx: Any, skip_unchanged: bool, skip_noflip: bool) -> None:
     """Marks the Hessian's tiles that are not zero in ``ctx.h_tile_nz``."""
-    lanes = LANES if wp.get_device().is_cuda else 1
+    lanes = block(LANES)
     changed = ctx.quad_changed_count if skip_unchanged else d.nefc
     flipped = ctx.state_changed_count if skip_noflip else changed
     wp.launch(

@@ -97,22 +97,22 @@ class Trees:
 
     def solve(self, m: Any, d: Any, damped: wp.array, x: wp.array, y: wp.array) -> None:
         """``(M + B) x = y``, B the diagonal by which ``damped`` is more than ``d.M``."""
+        lanes = block(self.lanes)
         wp.launch(
             _solve_kernel(self.bodies, self.dofs),
-            dim=(d.nworld, _block(self.lanes)),
-            inputs=[*self._inertias(m, d), d.M, damped, y],
+            dim=(d.nworld, lanes),
+            inputs=[*self._inertias(m, d), self.diagonal, d.M, damped, y],
             outputs=[x],
-            block_dim=_block(self.lanes),
+            block_dim=lanes,
         )
 
     def multiply(self, m: Any, d: Any, y: wp.array, x: wp.array, skip: wp.array) -> None:
         """``y = M x`` in the worlds that do not ``skip``."""
-        lanes = _block(self.lanes)
-        tables = [self.table, self.begin, self.levels]
+        lanes = block(self.lanes)
         wp.launch(
             _multiply_kernel(self.bodies),
             dim=(d.nworld, lanes),
-            inputs=[skip, *tables, d.cinert, d.cdof, m.dof_armature, x],
+            inputs=[skip, *self._inertias(m, d), x],
             outputs=[y],
             block_dim=lanes,
         )
@@ -121,7 +121,7 @@ class Trees:
         """The gradient of the cost and Newton's direction; ``again``: after the step ``ctx.alpha``
         along the one before, and anew only in worlds in which a constraint's state has changed."""
         contact, rows = d.contact, d.efc
-        lanes = _block(max(self.lanes, AGAIN if again else 32 * -(-self.dofs // CREW)))
+        lanes = block(max(self.lanes, AGAIN if again else 32 * -(-self.dofs // CREW)))
         wp.launch(
             _newton_kernel(self.bodies, self.dofs),
             dim=(d.nworld, lanes),
@@ -131,8 +131,6 @@ class Trees:
                 again,
                 ctx.alpha,
                 *self._inertias(m, d),
-                d.M,
-                d.M,
                 rows.Ma,
                 d.qfrc_smooth,
                 d.qfrc_constraint,
@@ -169,11 +167,11 @@ class Trees:
         )
 
     def _inertias(self, m: Any, d: Any) -> list[Any]:
-        tables = [self.table, self.begin, self.levels, self.diagonal]
-        return [*tables, d.cinert, d.cdof, m.dof_armature]
+        return [self.table, self.begin, self.levels, d.cinert, d.cdof, m.dof_armature]
 
 
-def _block(lanes: int) -> int:
+def block(lanes: int) -> int:
+    """Threads of a block on Warp's current device: one on a CPU."""
     return lanes if wp.get_device().is_cuda else 1
 
 
@@ -269,10 +267,10 @@ def _solve_kernel(bodies: int, dofs: int) -> wp.Kernel:
         table: wp.array(dtype=int),  # type: ignore[valid-type]
         begin: wp.array(dtype=int),  # type: ignore[valid-type]
         levels: int,
-        diagonal: wp.array(dtype=int),  # type: ignore[valid-type]
         inertia: wp.array2d(dtype=types.vec10),  # type: ignore[valid-type]
         axis: wp.array2d(dtype=wp.spatial_vector),  # type: ignore[valid-type]
         armature: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        diagonal: wp.array(dtype=int),  # type: ignore[valid-type]
         bare: wp.array2d(dtype=float),  # type: ignore[valid-type]
         damped: wp.array2d(dtype=float),  # type: ignore[valid-type]
         right: wp.array2d(dtype=float),  # type: ignore[valid-type]
@@ -284,10 +282,10 @@ def _solve_kernel(bodies: int, dofs: int) -> wp.Kernel:
         table: wp.array(dtype=int),  # type: ignore[valid-type]
         begin: wp.array(dtype=int),  # type: ignore[valid-type]
         levels: int,
-        diagonal: wp.array(dtype=int),  # type: ignore[valid-type]
         inertia: wp.array2d(dtype=types.vec10),  # type: ignore[valid-type]
         axis: wp.array2d(dtype=wp.spatial_vector),  # type: ignore[valid-type]
         armature: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        diagonal: wp.array(dtype=int),  # type: ignore[valid-type]
         bare: wp.array2d(dtype=float),  # type: ignore[valid-type]
         damped: wp.array2d(dtype=float),  # type: ignore[valid-type]
         right: wp.array2d(dtype=float),  # type: ignore[valid-type]
@@ -296,7 +294,7 @@ def _solve_kernel(bodies: int, dofs: int) -> wp.Kernel:
         w, lane = wp.tid()
         lanes = wp.block_dim()
         solve_trees(
-            w, lane, lanes, table, begin, levels, diagonal, inertia, axis, armature, bare, damped,
+            w, lane, lanes, table, begin, levels, inertia, axis, armature, diagonal, bare, damped,
             right, solution,
         )  # fmt: skip
 
@@ -359,12 +357,9 @@ def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
         table: wp.array(dtype=int),  # type: ignore[valid-type]
         begin: wp.array(dtype=int),  # type: ignore[valid-type]
         levels: int,
-        diagonal: wp.array(dtype=int),  # type: ignore[valid-type]
         inertia: wp.array2d(dtype=types.vec10),  # type: ignore[valid-type]
         axis: wp.array2d(dtype=wp.spatial_vector),  # type: ignore[valid-type]
         armature: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        bare: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        damped: wp.array2d(dtype=float),  # type: ignore[valid-type]
         moved: wp.array2d(dtype=float),  # type: ignore[valid-type]
         smooth: wp.array2d(dtype=float),  # type: ignore[valid-type]
         held: wp.array2d(dtype=float),  # type: ignore[valid-type]
@@ -403,12 +398,9 @@ def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
         table: wp.array(dtype=int),  # type: ignore[valid-type]
         begin: wp.array(dtype=int),  # type: ignore[valid-type]
         levels: int,
-        diagonal: wp.array(dtype=int),  # type: ignore[valid-type]
         inertia: wp.array2d(dtype=types.vec10),  # type: ignore[valid-type]
         axis: wp.array2d(dtype=wp.spatial_vector),  # type: ignore[valid-type]
         armature: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        bare: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        damped: wp.array2d(dtype=float),  # type: ignore[valid-type]
         moved: wp.array2d(dtype=float),  # type: ignore[valid-type]
         smooth: wp.array2d(dtype=float),  # type: ignore[valid-type]
         held: wp.array2d(dtype=float),  # type: ignore[valid-type]
@@ -460,10 +452,10 @@ def _newton_kernel(bodies: int, dofs: int) -> wp.Kernel:
             scales[w] = 1.0
         lanes = wp.block_dim()
         solve_trees(
-            w, lane, lanes, table, begin, levels, diagonal, inertia, axis, armature, bare, damped,
-            moved, smooth, held, where, stops, paths, centre, number, most, state, kind, id, mass,
-            start, column, entries, pairs, points, frames, friction, address, scratch, gradient,
-            solution, squares, decrements, steepnesses,
+            w, lane, lanes, table, begin, levels, inertia, axis, armature, moved, smooth, held,
+            where, stops, paths, centre, number, most, state, kind, id, mass, start, column,
+            entries, pairs, points, frames, friction, address, scratch, gradient, solution,
+            squares, decrements, steepnesses,
         )  # fmt: skip
 
     return newton_direction

@@ -32,14 +32,11 @@ _SOLVE = """
     const float* axes = (const float*)((const char*)axis.data + world * axis.strides[0]);
     const float* rotors = (const float*)((const char*)armature.data
         + (world % armature.shape[0]) * armature.strides[0]);
-    const float* before = (const float*)((const char*)bare.data + world * bare.strides[0]);
-    const float* after = (const float*)((const char*)damped.data + world * damped.strides[0]);
     const int* rows = table.data;
     for (int e = lane; e < BODIES * 27; e += lanes)
         slot[e] = 0.0f;
     for (int k = lane; k < DOFS; k += lanes) {
-        const int entry = diagonal.data[k];
-        along[k * 7 + 6] = rotors[k] + (after[entry] - before[entry]);
+        along[k * 7 + 6] = rotors[k];
         $right
     }
 $constraints
@@ -394,7 +391,13 @@ _COUPLING = """
     }
 """
 
-_PLAIN_RIGHT = "push[k] = ((const float*)((const char*)right.data + world * right.strides[0]))[k];"
+_PLAIN_RIGHT = """
+        const int entry = diagonal.data[k];
+        const char* after = (const char*)damped.data + world * damped.strides[0];
+        const char* before = (const char*)bare.data + world * bare.strides[0];
+        along[k * 7 + 6] += ((const float*)after)[entry] - ((const float*)before)[entry];
+        push[k] = ((const float*)((const char*)right.data + world * right.strides[0]))[k];
+"""
 
 _NEWTON_RIGHT = """
         const float g = ((const float*)((const char*)moved.data + world * moved.strides[0]))[k]
@@ -434,7 +437,7 @@ def solution(bodies: int, dofs: int) -> str:
     """``(M + B) x = y`` with a diagonal B, of models with so many bodies that move and degrees of
     freedom."""
     text = Template(_SOLVE).substitute(
-        constraints="", coupling="", right=_PLAIN_RIGHT, output=_PLAIN_OUTPUT
+        constraints="", coupling="", right=_PLAIN_RIGHT.strip(), output=_PLAIN_OUTPUT
     )
     return _fill(text, {"BODIES": bodies, "DOFS": dofs})
 

@@ -30,12 +30,12 @@ def _crumpled(physics: WarpPhysics, seed: int = 0, spread: float = 0.3) -> torch
     """Other poses in every world."""
     noise = torch.Generator().manual_seed(seed)
     pose = physics.qpos.cpu() + spread * torch.randn(physics.qpos.shape, generator=noise)
-    for agent in range(physics.scene.num_agents):
-        turn = physics.scene.agent_qpos(agent).start + 3
-        pose[:, turn : turn + 4] = torch.nn.functional.normalize(pose[:, turn : turn + 4], dim=-1)
-    for item in physics.scene.free_objects:
-        turn = physics.scene.object_qpos(item.name).start + 3
-        pose[:, turn : turn + 4] = torch.nn.functional.normalize(pose[:, turn : turn + 4], dim=-1)
+    scene = physics.scene
+    free = [scene.agent_qpos(a) for a in range(scene.num_agents)]
+    free += [scene.object_qpos(item.name) for item in scene.free_objects]
+    for part in free:
+        turn = slice(part.start + 3, part.start + 7)
+        pose[:, turn] = torch.nn.functional.normalize(pose[:, turn], dim=-1)
     return pose
 
 
@@ -139,7 +139,10 @@ def test_newton_s_direction(task: str, room: int, device: str, monkeypatch):
         found = -ctx.search.numpy().astype(float)
     assert (found[2] == -7.0).all()
     J, rows = d.efc.J.numpy()[:, 0], d.efc
-    columns, starts, lengths = rows.J_colind.numpy()[:, 0], rows.J_rowadr.numpy(), rows.J_rownnz
+    columns, starts, lengths = (
+        each.numpy() for each in (rows.J_colind, rows.J_rowadr, rows.J_rownnz)
+    )
+    masses, entries = rows.D.numpy(), d.M.numpy()
     kinds, ids, geoms = rows.type.numpy(), rows.id.numpy(), d.contact.geom.numpy()
     tree = np.asarray(model.body_treeid)[np.asarray(model.geom_bodyid)]
     for world in range(2):
@@ -148,15 +151,15 @@ def test_newton_s_direction(task: str, room: int, device: str, monkeypatch):
         for k in range(nv):
             for e in range(model.M_rowadr[k], model.M_rowadr[k] + model.M_rownnz[k]):
                 c = model.M_colind[e]
-                inertia[k, c] = inertia[c, k] = d.M.numpy()[world, e]
+                inertia[k, c] = inertia[c, k] = entries[world, e]
         hessian = inertia.copy()
         for e in range(min(counts[world], d.njmax)):
             if not state[world, e]:
                 continue
             j = np.zeros(nv)
-            own_row = slice(starts[world, e], starts[world, e] + lengths.numpy()[world, e])
-            j[columns[world, own_row]] = J[world, own_row]
-            hessian += rows.D.numpy()[world, e] * np.outer(j, j)
+            own_row = slice(starts[world, e], starts[world, e] + lengths[world, e])
+            j[columns[world, 0, own_row]] = J[world, own_row]
+            hessian += masses[world, e] * np.outer(j, j)
             limit = kinds[world, e] == int(types.ConstraintType.LIMIT_JOINT)
             both = not limit and (tree[geoms[ids[world, e]]] >= 0).all()
             moved += both
