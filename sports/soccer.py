@@ -59,8 +59,17 @@ class Soccer:
     others, and all in evaluation, kick off."""
     terminate_on_fall: bool = False
     """End the episode of an athlete that falls; else it is put back on its feet after 1 s."""
+    no_circling: bool = False
+    """Pay for the way that an athlete itself goes to the ball, and charge for going away from it.
+    By the paper's clamp going away is free: who circles beside a ball earns with every round."""
+
+    fall: float = 0.0
+    """What a fall costs. The paper's is free but for the second on the ground, and athletes run
+    faster than they can turn."""
 
     def __post_init__(self) -> None:
+        if self.fall < 0.0:
+            raise ValueError(f"the cost of a fall must not be negative: {self.fall}")
         if not 0.0 <= self.uniform <= 1.0:
             raise ValueError(f"the share of uniform starts must be in [0, 1], not {self.uniform}")
 
@@ -239,7 +248,10 @@ def advance(view: View, memory: Memory) -> Advance:
     points = side.masked_fill(void[:, None], 0.0)
 
     # Rewards: to the ball, and at the ball to the other goal.
-    to_ball = length(root - ball[:, None])
+    if view.config.no_circling:
+        approach = memory["to_ball"] - length(root - before[:, None])
+    else:
+        approach = clamp01(memory["to_ball"] - length(root - ball[:, None]))
     far, high = (HALF_LENGTH, 0.0, 0.0), (0.0, 0.0, GOAL_HEIGHT / 2)
     aim = goes[:, None] * constant(far, ball.device) + constant(high, ball.device)  # (A, 3)
     gained = length(before[:, None] - aim) - length(ball[:, None] - aim)
@@ -247,16 +259,18 @@ def advance(view: View, memory: Memory) -> Advance:
     plays = aside.square().sum(-1) < PLAYING_DISTANCE**2
     speed = ball_games.toward(ball[:, None], linvel[:, None], aim)
     terms = {
-        "approach": 0.05 * clamp01(memory["to_ball"] - to_ball),
+        "approach": 0.05 * approach,
         "dribble": 0.2 * gained * plays,
         "shot": 0.3 * speed * plays,
     }
     terms = {name: term.masked_fill(fouled, 0.0) for name, term in terms.items()}
     terms["goal"] = 10.0 * points
-
-    # Who lies too long is put on its feet, a ball over a wall is dropped inside.
     fallen = view.fallen()
     laid = ball_games.lying(view, memory, fallen)
+    if view.config.fall > 0.0:
+        terms["fall"] = -view.config.fall * (laid["falls"] - memory["falls"])
+
+    # Who lies too long is put on its feet, a ball over a wall is dropped inside.
     edge = HALF_LENGTH - 1.0, HALF_WIDTH - 1.0
     move, down, root_after = ball_games.get_up(view, laid["down"], *edge)
     x, y, z = ball.unbind(-1)

@@ -247,6 +247,43 @@ def test_stepping_back_from_the_ball_costs_nothing():
     assert pitch.advance().terms["approach"][0].tolist() == [0.0, 0.0]
 
 
+def earned_on_a_way(ways, **options) -> torch.Tensor:
+    """(2,) what either athlete has earned by approaching on its way about a ball that lies."""
+    pitch = match(ball=(0.0, 0.0, 0.11), **options)
+    earned = torch.zeros(2)
+    for places in ways:
+        for agent, (x, y) in enumerate(places):
+            pitch.stand(agent, x, y)
+        earned += pitch.advance().terms["approach"][0]
+    return earned
+
+
+@pytest.mark.parametrize("no_circling", [False, True])
+def test_who_circles_beside_the_ball_may_earn_nothing(no_circling):
+    """Athlete 0 goes round a circle beside the ball, athlete 1 straight to it."""
+    turns = [2.0 * math.pi * k / 40 for k in range(81)]
+    circle = [(-3.0 - math.sin(turn), 1.0 - math.cos(turn)) for turn in turns]
+    straight = [(3.0 - 0.03 * k, 0.0) for k in range(81)]
+    earned = earned_on_a_way(zip(circle, straight), no_circling=no_circling)
+    far, near = (math.hypot(x, STANDING - 0.11) for x in (3.0, 0.6))
+    assert earned[1] == pytest.approx(0.05 * (far - near), abs=1e-4)
+    if no_circling:
+        assert earned[0] == pytest.approx(0.0, abs=1e-4)
+    else:
+        assert earned[0] > 1.5 * earned[1]
+
+
+def test_a_ball_that_leaves_costs_nothing_and_one_that_comes_earns_nothing_without_circling():
+    pitch = match(no_circling=True)
+    for x in (1.0, -2.0):
+        pitch.ball((x, 0.0, 0.11))
+        assert pitch.advance().terms["approach"][0].tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
+    pitch.stand(0, -2.5, 0.0)
+    before, now = (math.hypot(x, STANDING - 0.11) for x in (1.0, 0.5))
+    earned = pitch.advance().terms["approach"][0]
+    assert earned.tolist() == pytest.approx([0.05 * (before - now), 0.0], abs=1e-4)
+
+
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize(
     ("at", "goal"), [((1.99, 0.5), 1), ((2.01, 0.5), 0), ((0.0, 1.99), 1), ((0.0, 2.01), 0)]
@@ -347,6 +384,15 @@ def test_getting_up_by_itself_starts_the_clock_again():
     assert not moved_by(pitch.advance()).mask.any()
     step = pitch.advance(down=(0,))
     assert not moved_by(step).mask.any() and step.metrics["falls"][0] == 2.0
+
+
+def test_a_fall_costs_what_is_asked_once_and_whoever_falls():
+    assert "fall" not in match().advance(down=(0,)).terms
+    pitch = match(fall=1.5)
+    costs = [pitch.advance(down=down).terms["fall"][0].tolist() for down in ((), (0,), (0, 1), ())]
+    assert costs == [[0.0, 0.0], [-1.5, 0.0], [0.0, -1.5], [0.0, 0.0]]
+    with pytest.raises(ValueError, match="must not be negative"):
+        match(fall=-1.0)
 
 
 def test_it_stands_up_where_nobody_is():
