@@ -7,6 +7,7 @@ of training (without it a deterministic engine would play one episode a thousand
 
 from __future__ import annotations
 
+import itertools
 import math
 import multiprocessing
 import os
@@ -33,6 +34,8 @@ from sports.starts import START_NOISE
 __all__ = ["EvaluationResult", "Recording", "evaluate", "interval", "standing_starts"]
 
 DEFAULT_WORLDS = {"mujoco": 250, "warp": 1000, "drake": 2}
+ROUNDS = 7
+"""Episodes that each world of a share plays at most, in Drake."""
 
 Progress = Callable[[int, int], None]
 """(trials done, trials) -> None"""
@@ -90,7 +93,8 @@ def evaluate(
         engine: ``mujoco``, ``warp`` or ``drake``.
         trials: number of episodes.
         seed: of starts and of everything random in the task.
-        num_worlds: worlds at once (per process); None for the engine's default.
+        num_worlds: worlds at once (per process); None for the engine's default. Other numbers are
+            other trials.
         strength: torque limits; None for those that the policy was trained with.
         limits: joint limits; likewise.
         options: the task's options; those that add to what the policy saw when it learned come
@@ -100,7 +104,8 @@ def evaluate(
         start_noise: +- joint noise of the standing start (rad).
         record: 0 for none, else keep the best and the median episode.
         record_worlds: also keep the first episode of these worlds (of the first process).
-        processes: for drake, which steps worlds in sequence; None for one per core.
+        processes: for drake, which steps worlds in sequence; None for one per core. The trials
+            are the same whatever their number.
         progress: called with (trials done, trials).
 
     Raises ValueError for an unknown task or option and PolicyError for a policy that does not
@@ -123,8 +128,8 @@ def evaluate(
         timestep_divisor=timestep_divisor,
     )
     worlds = num_worlds or DEFAULT_WORLDS.get(engine, DEFAULT_WORLDS["mujoco"])
-    many = engine == "drake" and (processes is None or processes > 1)
-    workers = min(processes or os.cpu_count() or 1, trials) if many else 1
+    sizes = _sizes(trials, worlds) if engine == "drake" else [trials]
+    workers = min(processes or os.cpu_count() or 1, len(sizes))
     shares = [
         Share(
             task=task,
@@ -141,7 +146,7 @@ def evaluate(
             record=record > 0,
             worlds_recorded=record_worlds if i == 0 else (),
         )
-        for i, size in enumerate(_sizes(trials, worlds, workers))
+        for i, size in enumerate(sizes)
     ]
     played = _run(policy, shares, workers, trials, progress)
     values = {name: np.concatenate([p.trials[name] for p in played]) for name in played[0].trials}
@@ -204,11 +209,13 @@ def interval(values: np.ndarray, unit: str) -> dict[str, Any]:
     return {"mean": mean, "ci95": [mean - half, mean + half], "n": n, "unit": unit}
 
 
-def _sizes(trials: int, worlds: int, workers: int) -> list[int]:
-    """Trials of each share: multiples of ``worlds`` but the last, about four shares per worker."""
-    if workers == 1:
-        return [trials]
-    size = max(1, math.ceil(trials / (4 * workers * worlds))) * worlds
+def _sizes(trials: int, worlds: int) -> list[int]:
+    """Trials of each share in Drake: an eighth of all, at most ``ROUNDS`` in each of its worlds.
+
+    A share has a seed of its own, so how many there are may not depend on how many processes play
+    them: the same seed is the same trials on every machine.
+    """
+    size = min(math.ceil(trials / (8 * worlds)), ROUNDS) * worlds
     return [min(size, trials - start) for start in range(0, trials, size)]
 
 
@@ -218,7 +225,11 @@ def _run(
     """Plays them here, or in processes of their own."""
     report = progress or (lambda done, total: None)
     if workers == 1:
-        return [play_share(policy, share, lambda done: report(done, trials)) for share in shares]
+        before = itertools.accumulate((share.trials for share in shares), initial=0)
+        return [
+            play_share(policy, share, lambda done, n=n: report(n + done, trials))
+            for n, share in zip(before, shares, strict=False)
+        ]
     played: dict[int, Played] = {}
     context = multiprocessing.get_context("spawn")
     report(0, trials)

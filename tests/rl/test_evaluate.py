@@ -263,15 +263,36 @@ def test_a_recording_keeps_what_its_task_shows(tmp_path):
         assert (first.shown["phases"][0] != second.shown["phases"][0]).all()
 
 
-@pytest.mark.parametrize("processes", [2])
-def test_drake_trials_in_processes(processes):
+@pytest.fixture(scope="module")
+def drake_trials():
+    """Six trials in Drake, two processes: three shares of two worlds."""
     pytest.importorskip("pydrake")
-    result = evaluate("zero", "high_jump", engine="drake", trials=4, processes=processes, record=1)
-    assert result.result["metrics"]["success"]["n"] == 4
-    np.testing.assert_allclose(result.trials["bar_height"], [1.0, 1.5, 1.0, 1.5])
+    return evaluate("zero", "high_jump", engine="drake", trials=6, processes=2, record=1)
+
+
+def test_drake_trials_in_processes(drake_trials):
+    result = drake_trials
+    assert result.result["metrics"]["success"]["n"] == 6
+    np.testing.assert_allclose(result.trials["bar_height"], [1.0, 1.5] * 3)
     assert len(result.median.qpos) in result.trials["episode_steps"]
     assert result.result["timestep"] == pytest.approx(1 / 480)  # Drake's own, not the task's
     assert result.result["timestep"] * result.result["substeps"] == pytest.approx(1 / 30)
     # standing at PD target zero ends by the stall rule at the same step in both engines
-    mujoco = evaluate("zero", "high_jump", trials=4)
+    mujoco = evaluate("zero", "high_jump", trials=6)
     np.testing.assert_array_equal(mujoco.trials["episode_steps"], result.trials["episode_steps"])
+
+
+def test_how_many_processes_play_drake_does_not_change_its_trials(drake_trials):
+    done = []
+    here = evaluate(
+        "zero",
+        "high_jump",
+        engine="drake",
+        trials=6,
+        processes=1,
+        progress=lambda n, _: done.append(n),
+    )
+    returns = here.trials["return"]
+    np.testing.assert_array_equal(returns, drake_trials.trials["return"])
+    assert len(set(returns.tolist())) == 6  # a start of its own for each
+    assert done == sorted(done) and done[-1] == 6
