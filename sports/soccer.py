@@ -46,6 +46,8 @@ KICK_OFF = ((-3.0, 0.0), (-8.0, -3.0))
 UNIFORM_HALF = (13.0, 8.0)
 LEAST_DISTANCE = 2.0
 """m; of starts anywhere. More than the rule's 1 m: arms are stretched out by 0.9 m."""
+BESIDE = (2.0, 3.0)
+"""m, from an athlete to a ball that starts beside it."""
 LAYOUTS = 24
 """Drawn to find one with that distance; all fail once in 1e11 starts of five points."""
 
@@ -57,6 +59,9 @@ class Soccer:
     uniform: float = 0.5
     """Share of training episodes that start with ball and players anywhere on the field; the
     others, and all in evaluation, kick off."""
+    beside: float = 0.0
+    """Share of the starts anywhere that have the ball 2 to 3 m from one of the athletes: from the
+    others nearly all that is learned from is running."""
     terminate_on_fall: bool = False
     """End the episode of an athlete that falls; else it is put back on its feet after 1 s."""
     no_circling: bool = False
@@ -72,6 +77,8 @@ class Soccer:
             raise ValueError(f"the cost of a fall must not be negative: {self.fall}")
         if not 0.0 <= self.uniform <= 1.0:
             raise ValueError(f"the share of uniform starts must be in [0, 1], not {self.uniform}")
+        if not 0.0 <= self.beside <= 1.0:
+            raise ValueError(f"the share beside the ball must be in [0, 1], not {self.beside}")
 
 
 def football(pos: tuple[float, float, float]) -> SceneObject:
@@ -175,6 +182,26 @@ def scene(config: Soccer, body: Body, team_size: int) -> Scene:
     )
 
 
+def ball_beside_one(
+    layouts: Tensor, share: float, half: Tensor, generator: torch.Generator
+) -> Tensor:
+    """Layouts (N, K, A + 1, 2) of the athletes and, last, the ball (m), with the ball of a
+    ``share`` of the N worlds beside one athlete, in a random direction, but within +-``half``
+    (2,)."""
+    n, tried, things, _ = layouts.shape
+    draw = torch.rand(n, tried, 4, device=layouts.device, generator=generator)
+    angle, way, which, chosen = draw.unbind(-1)
+    which = (which * (things - 1)).long()[..., None, None]
+    athlete = torch.take_along_dim(layouts, which, 2)[:, :, 0]
+    way = (BESIDE[0] + (BESIDE[1] - BESIDE[0]) * way)[..., None]
+    angle = 2.0 * math.pi * angle
+    ball = athlete + way * torch.stack((angle.cos(), angle.sin()), -1)
+    ball = torch.where(
+        (chosen[:, :1] < share)[..., None], ball.clamp(-half, half), layouts[:, :, -1]
+    )
+    return torch.cat((layouts[:, :, :-1], ball[:, :, None]), 2)
+
+
 def start(
     view: View,
     state: PhysicsState,
@@ -190,7 +217,10 @@ def start(
     device, agents = state.qpos.device, physics.num_agents
     half = constant(UNIFORM_HALF, device)
     draw = torch.rand(n, LAYOUTS, agents + 1, 2, device=device, generator=generator)
-    places = ball_games.apart((2.0 * draw - 1.0) * half, LEAST_DISTANCE)
+    layouts = (2.0 * draw - 1.0) * half
+    if view.config.beside > 0.0:
+        layouts = ball_beside_one(layouts, view.config.beside, half, generator)
+    places = ball_games.apart(layouts, LEAST_DISTANCE)
     other = torch.rand(n, agents + 1, device=device, generator=generator)
     uniform = (other[:, -1] < view.config.uniform)[:, None]
     spin = math.pi * other  # half of the yaw, which is in [0, 2 pi)

@@ -71,6 +71,26 @@ def test_starts_anywhere_are_on_the_field_and_apart(task):
         make_env(task, num_worlds=1, options={"uniform": 1.5})
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_a_ball_may_start_beside_one_of_the_athletes(task):
+    far = {}
+    for share in (0.0, 0.75, 1.0):
+        env = make_env(task, num_worlds=400, seed=4, options={"uniform": 1.0, "beside": share})
+        athletes, ball = env.physics.body_pos[:, :, 0, :2], env.physics.object_pos[:, 0, :2]
+        gaps = (athletes - ball[:, None]).norm(dim=-1)
+        assert gaps.min() > 2.0 - 1e-3
+        assert (ball[:, 0].abs() <= 13.0).all() and (ball[:, 1].abs() <= 8.0).all()
+        far[share] = float((gaps.min(1).values > 3.0 + 1e-3).float().mean())
+    assert far[1.0] == 0.0 and far[0.75] == pytest.approx(0.25 * far[0.0], abs=0.07)
+    nearest = gaps.argmin(1)
+    share_of_each = nearest.bincount(minlength=gaps.shape[1]) / len(gaps)
+    assert (share_of_each - 1.0 / gaps.shape[1]).abs().max() < 0.08
+    way = ball - torch.take_along_dim(athletes, nearest[:, None, None], 1)[:, 0]
+    assert (way.sign().mean(0).abs() < 0.2).all()  # on every side of it
+    with pytest.raises(ValueError, match="share beside the ball"):
+        make_env(task, num_worlds=1, options={"beside": -0.1})
+
+
 # Who sees what.
 
 
