@@ -67,7 +67,6 @@ class Soccer:
     no_circling: bool = False
     """Pay for the way that an athlete itself goes to the ball, and charge for going away from it.
     By the paper's clamp going away is free: who circles beside a ball earns with every round."""
-
     fall: float = 0.0
     """What a fall costs. The paper's is free but for the second on the ground, and athletes run
     faster than they can turn."""
