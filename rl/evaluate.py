@@ -7,7 +7,6 @@ of training (without it a deterministic engine would play one episode a thousand
 
 from __future__ import annotations
 
-import itertools
 import math
 import multiprocessing
 import os
@@ -225,11 +224,11 @@ def _run(
     """Plays them here, or in processes of their own."""
     report = progress or (lambda done, total: None)
     if workers == 1:
-        before = itertools.accumulate((share.trials for share in shares), initial=0)
-        return [
-            play_share(policy, share, lambda done, n=n: report(n + done, trials))
-            for n, share in zip(before, shares, strict=False)
-        ]
+        here, before = [], 0
+        for share in shares:
+            here.append(play_share(policy, share, lambda done, n=before: report(n + done, trials)))
+            before += share.trials
+        return here
     played: dict[int, Played] = {}
     context = multiprocessing.get_context("spawn")
     report(0, trials)

@@ -267,24 +267,15 @@ def test_stepping_back_from_the_ball_costs_nothing():
     assert pitch.advance().terms["approach"][0].tolist() == [0.0, 0.0]
 
 
-def earned_on_a_way(ways, **options) -> torch.Tensor:
-    """(2,) what either athlete has earned by approaching on its way about a ball that lies."""
-    pitch = match(ball=(0.0, 0.0, 0.11), **options)
-    earned = torch.zeros(2)
-    for places in ways:
-        for agent, (x, y) in enumerate(places):
-            pitch.stand(agent, x, y)
-        earned += pitch.advance().terms["approach"][0]
-    return earned
-
-
 @pytest.mark.parametrize("no_circling", [False, True])
 def test_who_circles_beside_the_ball_may_earn_nothing(no_circling):
     """Athlete 0 goes round a circle beside the ball, athlete 1 straight to it."""
-    turns = [2.0 * math.pi * k / 40 for k in range(81)]
-    circle = [(-3.0 - math.sin(turn), 1.0 - math.cos(turn)) for turn in turns]
-    straight = [(3.0 - 0.03 * k, 0.0) for k in range(81)]
-    earned = earned_on_a_way(zip(circle, straight), no_circling=no_circling)
+    pitch, earned = match(no_circling=no_circling), torch.zeros(2)
+    for k in range(81):
+        turn = 2.0 * math.pi * k / 40
+        pitch.stand(0, -3.0 - math.sin(turn), 1.0 - math.cos(turn))
+        pitch.stand(1, 3.0 - 0.03 * k, 0.0)
+        earned += pitch.advance().terms["approach"][0]
     far, near = (math.hypot(x, STANDING - 0.11) for x in (3.0, 0.6))
     assert earned[1] == pytest.approx(0.05 * (far - near), abs=1e-4)
     if no_circling:
