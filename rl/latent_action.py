@@ -14,8 +14,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from rl.prior import LatentPrior, PriorError, body_digest, check_layout
-from sports.humanoid.body import Body, is_finger
+from rl.prior import LatentPrior, PriorError, body_digest, check_layout, self_layout
+from rl.prior_body import SeenAs
+from sports.humanoid.body import Body, is_finger, load_body
 from sports.scene import Scene
 
 
@@ -54,6 +55,23 @@ def arm_dofs(body: Body, tools: tuple[str, ...]) -> list[int]:
     return [i for i, dof in enumerate(body.dofs) if dof.link in arm]
 
 
+def _seen_as(prior: LatentPrior, body: Body, device: torch.device | str) -> SeenAs | None:
+    """How the prior sees the athlete; None where it is the very body. Raises PriorError."""
+    known, digest = prior.card["body"], prior.card["body_digest"]
+    if digest == body_digest(body):
+        return None
+    try:
+        told = load_body(known)
+        if digest == body_digest(told):
+            return SeenAs(told, body, device)
+    except (ValueError, KeyError):
+        pass  # no body of ours, or none that this one is like
+    raise PriorError(
+        f"the prior is of body '{known}', the athlete of this task is '{body.name}': use a prior "
+        "of that body, or of the same without fingers"
+    )
+
+
 class LatentActions:
     """(N, A, D) observations and (N, A, ``size``) policy's actions -> (N, A, n) actions."""
 
@@ -72,14 +90,12 @@ class LatentActions:
         tools: links that hold the task's tool.
         device: where the environment lives.
 
-        Raises PriorError for a prior of another body, ValueError for an arm without a tool.
+        Raises PriorError for a prior of another body, unless the athlete is that body with
+        fingers (``rl.prior_body``), ValueError for an arm without a tool.
         """
         body = scene.body
-        if prior.card["body_digest"] != body_digest(body):
-            raise PriorError(
-                f"the prior is of body '{prior.card['body']}', the athlete of this task is "
-                f"'{body.name}': use a prior of that body"
-            )
+        self._seen = _seen_as(prior, body, device)
+        self._layout = prior.card["layout"] if self._seen is None else self_layout(body.num_links)
         self.prior, self.config = prior.to(device), config
         scale, offset = body.action_scale(), scene.action_offset()
 
@@ -103,11 +119,18 @@ class LatentActions:
 
     def check(self, slices: dict[str, slice]) -> None:
         """Raises PriorError unless observations begin with the body as the prior sees it."""
-        check_layout(self.prior.card["layout"], slices)
+        check_layout(self._layout, slices)
+
+    def _state(self, obs: Tensor) -> Tensor:
+        """(..., D) -> (..., D or S) observations that begin with the body as the prior sees it."""
+        return obs if self._seen is None else self._seen.state(obs)
 
     def latent(self, obs: Tensor, action: Tensor) -> Tensor:
         """(..., D), (..., size) -> (..., Z)."""
-        mean, sigma = self.prior.moments(obs)
+        return self._latent(self._state(obs), action)
+
+    def _latent(self, state: Tensor, action: Tensor) -> Tensor:
+        mean, sigma = self.prior.moments(state)
         a = action[..., : self.prior.latent].float()
         if self.config.combine == "free":
             return mean + a
@@ -117,6 +140,9 @@ class LatentActions:
     @torch.no_grad()
     def __call__(self, obs: Tensor, action: Tensor) -> Tensor:
         """PD targets of the decoder, as the task's actions; the environment clips them."""
-        decoded = self.prior.decode(obs, self.latent(obs, action))
+        state = self._state(obs)
+        decoded = self.prior.decode(state, self._latent(state, action))
+        if self._seen is not None:
+            decoded = self._seen.targets(decoded)
         arm = torch.tanh(action[..., self.prior.latent :].float()) @ self._spread
         return self._free * (decoded - self._offset) + arm

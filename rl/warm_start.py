@@ -6,6 +6,11 @@ go to the slices of the same names, and those of slices it has never seen, such 
 are zero. In the beginning it therefore plays as before, whatever the opponent does. The same goes
 for a task whose options show more than the policy's did. Where actions are around another pose,
 its last layer is made to ask for the same joint angles.
+
+One that acts through a latent prior may also begin another body's task, where the athlete is its
+own with fingers (``rl.prior_body``). What it read of a link it reads of the same; of a hand that is
+wrist and fingers there, of the wrist, which turns alike and is near, so that it plays nearly as
+before.
 """
 
 from __future__ import annotations
@@ -17,7 +22,10 @@ import torch
 from rl.config import TRACKING
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError, read_policy
+from rl.prior_body import counterparts
 from sports.env import make_scene
+from sports.frames import proprioception_slices
+from sports.humanoid.body import Body, load_body
 from sports.registry import task_names
 
 ALIASES: dict[str, tuple[str, ...]] = {
@@ -63,7 +71,7 @@ def _same_athlete(policy: Policy, env: Any, task: str, source: str) -> None:
     card = policy.metadata
     found, body = card["task"], getattr(env.task, "body", "none")
     where = f"the policy '{source}' of task '{found}' cannot start '{task}'"
-    if card["body"] != body:
+    if card["body"] != body and not _acts_alike(policy, env):
         raise PolicyError(f"{where}: its body is '{card['body']}', not '{body}'")
     if card["action_size"] != env.action_size:
         raise PolicyError(
@@ -75,17 +83,50 @@ def _same_athlete(policy: Policy, env: Any, task: str, source: str) -> None:
         raise PolicyError(f"{where}: actions of '{TRACKING}' are around the clips' poses")
 
 
+def _acts_alike(policy: Policy, env: Any) -> bool:
+    """Whether latents of a policy of another body mean the same to the environment's athlete."""
+    layer = getattr(env, "layer", None)
+    if layer is None or policy.prior is None or layer.prior.digest != policy.prior.digest:
+        return False
+    try:
+        counterparts(load_body(policy.metadata["body"]), env.physics.scene.body)
+    except ValueError:
+        return False
+    return True
+
+
+def _links_read(known: Body, body: Body) -> dict[int, list[int]]:
+    """For each feature of ``body`` those of the ``known`` one that are read of it: of the same link
+    first, then of links that are parts of it there."""
+    here, there = (proprioception_slices(x.num_links) for x in (body, known))
+    found = counterparts(known, body)
+    order = sorted(range(known.num_links), key=lambda i: known.link_names[i] not in body.link_names)
+    read = {0: [0]}  # the root's height
+    for name, width in (("body_pos", 3), ("body_rot", 6), ("body_linvel", 3), ("body_angvel", 3)):
+        skipped = int(name == "body_pos")  # the root has no position
+        for i in (i for i in order if i >= skipped):
+            to = here[name].start + width * (found[i] - skipped)
+            of = there[name].start + width * (i - skipped)
+            for k in range(width):
+                read.setdefault(to + k, []).append(of + k)
+    return read
+
+
 def _moved(policy: Policy, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
     assert policy.actor is not None
     card, layout = policy.metadata, policy.metadata["obs_layout"]
     columns = torch.full((env.obs_size,), -1)
     """Column of the policy for each feature; -1 for none."""
     for name, own in env.obs_slices.items():
-        parts = (name,) if name in layout else ALIASES.get(name, ())
-        spans = [range(*layout[part]) for part in parts if part in layout]
+        names = (name,) if name in layout else ALIASES.get(name, ())
+        spans = [range(*layout[part]) for part in names if part in layout]
         known = [column for span in spans for column in span]
         if len(known) == own.stop - own.start:
             columns[own] = torch.tensor(known)
+    body = env.physics.scene.body
+    read = {} if card["body"] == body.name else _links_read(load_body(card["body"]), body)
+    for to, parts in read.items():
+        columns[to] = parts[0]
     new = columns < 0
     if bool(new.all()):
         raise PolicyError(
@@ -93,7 +134,12 @@ def _moved(policy: Policy, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
         )
     old = columns.clamp(min=0)
     weights = dict(policy.actor.state_dict())
-    weights["trunk.0.weight"] = weights["trunk.0.weight"][:, old].masked_fill(new, 0.0)
+    before = weights["trunk.0.weight"]
+    weights["trunk.0.weight"] = before[:, old].masked_fill(new, 0.0)
+    for to, (whole, *parts) in read.items():  # parts: as the whole, but for where they are
+        for part in parts:
+            share = policy.std[whole] / policy.std[part]
+            weights["trunk.0.weight"][:, to] += share * before[:, part]
     if card["task"] in task_names() and getattr(env, "layer", None) is None:
         # The same PD targets: offset + scale a of one task in terms of the other's.
         scene = make_scene(card["task"], limits=card["limits"])
@@ -109,7 +155,8 @@ def _moved(policy: Policy, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
     actor = MLP(*sizes, card["activation"])
     actor.load_state_dict(weights)
     layout = {k: [s.start, s.stop] for k, s in env.obs_slices.items()}
-    card = {**card, "task": task, "obs_size": env.obs_size, "obs_layout": layout}
+    shown = {"obs_size": env.obs_size, "obs_layout": layout}
+    card = {**card, "task": task, "body": body.name, **shown}
     mean = policy.mean[old].masked_fill(new, 0.0)
     std = policy.std[old].masked_fill(new, 1.0)
     return Policy(actor.requires_grad_(False), mean, std, card, prior=policy.prior), new

@@ -512,16 +512,24 @@ def test_the_commands(folder, tmp_path, capsys):
     task = ["--worlds", "4", "--samples", "32", "--ppo.steps", "4", "--ppo.minibatches", "2"]
     task += ["--ppo.hidden", "8", "--quiet", "--prior", str(file), "--latent.span", "2"]
     assert main(["train", "hurdling", "--out", policy, *task]) == 0
+    thrower = str(tmp_path / "thrower")  # who has fingers, and is moved as one without
+    assert main(["train", "javelin", "--out", thrower, *task]) == 0
+    env = make_env("javelin", num_worlds=2)
+    learned = load_policy(thrower, "javelin")
+    learned.check(env)
+    assert learned(env.reset()).shape == (2, 1, 153)
+    env.close()
     capsys.readouterr()
     # A user's mistakes: code 2, one sentence, nothing written.
-    none = str(tmp_path / "none")
+    none, fingers = str(tmp_path / "none"), str(tmp_path / "fingers.safetensors")
+    save_prior(made_prior("smplx"), fingers, half=False)
     for wrong, sentence in (
         (["prior", "check", tracker, "--clips", library], "of task 'tracking', not of 'prior'"),
         (["prior", "play", run, "--clips", library, "--out", f"{none}.gif"], "must end in .mp4"),
         (["prior", "export", none, "--out", f"{none}.safetensors"], "there is no prior"),
         (["prior", "frobnicate"], "prior has no command"),
         (["train", "hurdling", "--prior", none, "--out", none], "there is no prior"),
-        (["train", "javelin", "--prior", str(file), "--out", none], "of body 'smpl', the athlete"),
+        (["train", "hurdling", "--prior", fingers, "--out", none], "of body 'smplx', the athlete"),
         (["train", "prior", "--clips", library, "--out", none], "give --tracker"),
         (["evaluate", "hurdling", "--policy", run, "--out", none], "'distillation'"),
     ):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +14,19 @@ from safetensors.torch import save_file
 
 from rl.checkpoint import checkpoints, load_checkpoint
 from rl.evaluate import evaluate
+from rl.latent_action import LatentActions, LatentConfig
 from rl.match import Setting, play_match
 from rl.networks import MLP
 from rl.normalizer import Normalizer
-from rl.policy import FORMAT, PolicyError
+from rl.policy import FORMAT, PolicyError, read_policy
 from rl.ppo import PPOConfig
+from rl.prior import LatentPrior, save_prior
 from rl.train import TrainConfig, train
 from rl.warm_start import load_start
 from sports.env import make_env
+from sports.humanoid.body import is_finger, load_body
 from tests.rl.contest import Contest
+from tests.rl.latent_made import made_prior
 from warmstart.atomic import write_json
 
 HIDDEN = (8, 8)
@@ -30,8 +36,6 @@ def policy_file(
     folder: Path, of: str, options: dict[str, Any] | None = None, **changes: object
 ) -> str:
     """A made-up policy of a task, with statistics of its own, as a file."""
-    import hashlib
-
     env = make_env(of, num_worlds=1, options=options)
     g = torch.Generator().manual_seed(5)
     actor = MLP(env.obs_size, HIDDEN, env.action_size, "silu", 1.0, g)
@@ -182,6 +186,71 @@ def test_another_athlete_is_refused_with_a_sentence(tmp_path):
         load_start(source, make_env("tennis_1v1", num_worlds=1), "tennis_1v1")
     with pytest.raises(ValueError, match="baseline"):
         load_start("zero", boxing, "boxing")
+
+
+def latent_file(folder: Path, of: str) -> tuple[str, LatentPrior]:
+    """A made-up policy of a task for athletes without fingers, in latents, beside its prior."""
+    prior = made_prior("smpl")
+    save_prior(prior, folder / "prior.safetensors", half=False)
+    latent = {"prior_digest": prior.digest, **asdict(LatentConfig())}
+    env = make_env(of, num_worlds=1)
+    actor = MLP(env.obs_size, HIDDEN, prior.latent, "silu", 1.0, torch.Generator().manual_seed(6))
+    env.close()
+    path = Path(policy_file(folder, of, algo="latent", action_size=prior.latent, latent=latent))
+    save_file(dict(actor.state_dict()), path)
+    card = json.loads(path.with_suffix(".json").read_text())
+    card["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    write_json(path.with_suffix(".json"), card)
+    return str(path), prior
+
+
+def test_a_footballer_in_latents_begins_as_an_athlete_with_fingers(tmp_path):
+    """What it read of a link it reads of the same, and of a hand as of the wrist."""
+    source, prior = latent_file(tmp_path, "soccer_1v1")
+    env = make_env("basketball_1v1", num_worlds=1)
+    scene = env.physics.scene
+    with pytest.raises(PolicyError, match="its body is 'smpl', not 'smplx'"):
+        load_start(source, env, "basketball_1v1")  # there is no layer
+    env.act_through(LatentActions(prior, LatentConfig(), scene, (), env.device))
+    policy, unseen = load_start(source, env, "basketball_1v1")
+    before = read_policy(source, "soccer_1v1")
+    assert policy.metadata["body"] == "smplx" and policy.metadata["task"] == "basketball_1v1"
+    known, body = load_body("smpl"), scene.body
+    where = {k: slice(*v) for k, v in before.metadata["obs_layout"].items()}
+
+    # In units of the normaliser: any posture whose hands are turned as the wrists.
+    g = torch.Generator().manual_seed(1)
+    old = torch.randn(5, before.metadata["obs_size"], generator=g)
+    new = torch.randn(5, env.obs_size, generator=g)
+    new[:, 0] = old[:, 0]
+    for name in ("own_goal", "other_goal"):  # there are rims
+        old[:, where[f"goal/{name}"]] = 0.0
+    for name in env.obs_slices:
+        if name.startswith(("goal/ball", "goal/opponent")):
+            new[:, env.obs_slices[name]] = old[:, where[name]]
+    for name, width in (("body_pos", 3), ("body_rot", 6), ("body_linvel", 3), ("body_angvel", 3)):
+        first = int(name == "body_pos")
+
+        def of(links, which, link):
+            at = which[name].start + width * (links.link_index(link) - first)
+            return slice(at, at + width)
+
+        for link in known.link_names[first:]:
+            here = of(known, where, link)
+            if link in body.link_names:
+                new[:, of(body, env.obs_slices, link)] = old[:, here]
+            else:
+                wrist = of(known, where, link.replace("Hand", "Wrist"))
+                old[:, here] = old[:, wrist] * before.std[wrist] / before.std[here]
+    torch.testing.assert_close(policy.actor(new), before.actor(old), atol=1e-5, rtol=1e-5)
+    fingers = [i for i, link in enumerate(body.link_names) if is_finger(link)]
+    rot = env.obs_slices["body_rot"].start
+    assert all(unseen[rot + 6 * i : rot + 6 * i + 6].all() for i in fingers)
+    assert int(unseen[: 15 * body.num_links - 2].sum()) == 15 * len(fingers)
+    env.act_through(LatentActions(made_prior("smpl", seed=1), LatentConfig(), scene, (), "cpu"))
+    with pytest.raises(PolicyError, match="its body is 'smpl', not 'smplx'"):
+        load_start(source, env, "basketball_1v1")  # another prior's latents
+    env.close()
 
 
 def test_new_features_take_the_statistics_of_what_is_seen_first():
