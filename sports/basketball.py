@@ -120,6 +120,7 @@ def start(
     beside = torch.take_along_dim(roots, chosen[:, None, None], 1)[:, 0]
     angle, far = 2 * math.pi * angle, BESIDE[0] + (BESIDE[1] - BESIDE[0]) * far
     ball = layout.object_qpos("ball").start
+    ball_games.turn_ball(state, ball, generator)
     way = far[:, None] * torch.stack((angle.cos(), angle.sin()), -1)
     state.qpos[:, ball : ball + 2] = beside + way
     return state, {}

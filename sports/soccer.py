@@ -210,9 +210,11 @@ def start(
 ) -> tuple[PhysicsState, Memory]:
     """Kick-off, or in training for a share of the worlds ball and players anywhere, facing
     anywhere."""
+    physics, n = view.physics.scene, state.qpos.shape[0]
+    ball_at = physics.object_qpos("ball").start
+    ball_games.turn_ball(state, ball_at, generator)
     if not training or view.config.uniform == 0.0:
         return state, {}
-    physics, n = view.physics.scene, state.qpos.shape[0]
     device, agents = state.qpos.device, physics.num_agents
     half = constant(UNIFORM_HALF, device)
     draw = torch.rand(n, LAYOUTS, agents + 1, 2, device=device, generator=generator)
@@ -226,7 +228,7 @@ def start(
     zero = torch.zeros_like(spin)
     turn = torch.stack((spin.cos(), zero, zero, spin.sin()), -1)
     rows = [physics.agent_qpos(a).start for a in range(agents)]
-    for k, first in enumerate([*rows, physics.object_qpos("ball").start]):
+    for k, first in enumerate([*rows, ball_at]):
         at = slice(first, first + 2)
         state.qpos[:, at] = torch.where(uniform, places[:, k], state.qpos[:, at])
     for k, first in enumerate(rows):

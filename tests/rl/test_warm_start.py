@@ -231,7 +231,7 @@ def test_a_footballer_in_latents_begins_as_an_athlete_with_fingers(tmp_path):
     for name, width in (("body_pos", 3), ("body_rot", 6), ("body_linvel", 3), ("body_angvel", 3)):
         first = int(name == "body_pos")
 
-        def of(links, which, link):
+        def of(links, which, link, name=name, width=width, first=first):
             at = which[name].start + width * (links.link_index(link) - first)
             return slice(at, at + width)
 

@@ -53,6 +53,19 @@ def test_the_kick_off(task):
     assert env.max_steps == 3000 and env.reward_scale == 3.0
 
 
+@pytest.mark.parametrize("training", [False, True])
+@pytest.mark.parametrize("task", [*TASKS, "basketball_1v1"])
+def test_a_ball_at_the_start_does_not_tell_whose_half_it_is(task, training):
+    """It is turned in any direction alike: its mean is none, and so is that of any of its axes, in
+    units of their spread (1/3 for the square of a component)."""
+    env = make_env(task, num_worlds=400, seed=2, training=training)
+    rot = quaternion.matrix(env.physics.object_quat[:, 0])
+    error = rot.mean(0) / (1.0 / 3.0 / 400) ** 0.5
+    assert error.abs().max() < 4.0
+    assert ((rot.square().mean(0) - 1.0 / 3.0).abs() < 0.06).all()
+    env.close()
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_starts_anywhere_are_on_the_field_and_apart(task):
     env = make_env(task, num_worlds=300, seed=4, options={"uniform": 1.0})
