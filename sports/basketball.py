@@ -46,6 +46,8 @@ BALL_HEIGHT, DROP_HEIGHT = 1.0, 2.5
 """Of the ball at the start, under outstretched arms, and where it is dropped inside (m)."""
 INSIDE = 0.5
 """A ball is dropped this far inside the lines (m), an athlete put on its feet twice as far."""
+LOW = 0.2
+"""A ball whose middle is lower (m; it lies at 0.12) is on the floor."""
 STILL_SPEED, STILL_STEPS, HIGH = 0.1, 30, 2.0
 """A ball that is slower than this (m/s) for 1 s above this height (m) lies on a ring."""
 LIMBS = ("L_Wrist", "R_Wrist", "L_Ankle", "R_Ankle")
@@ -61,8 +63,18 @@ class Basketball:
     uniform: float = 0.5
     """Share of training episodes that start with the players anywhere on the court; the others, and
     all in evaluation, begin where a tip-off would be. The ball is beside any of them."""
+    jump_ball: float = 0.0
+    """Seconds for which a ball may lie or roll on the floor; then it is dropped there from above
+    all heads. 0 for ever, as in the paper: from then on nobody's hands come near it."""
+    fall: float = 0.0
+    """What a fall costs. The paper's is free but for the second on the floor."""
 
     def __post_init__(self) -> None:
+        if min(self.jump_ball, self.fall) < 0.0:
+            raise ValueError(
+                "the seconds until a jump ball and the cost of a fall must not be negative: "
+                f"{self.jump_ball}, {self.fall}"
+            )
         if not 0.0 <= self.uniform <= 1.0:
             raise ValueError(f"the share of uniform starts must be in [0, 1], not {self.uniform}")
 
@@ -140,6 +152,7 @@ def begin(view: View, context: Memory) -> Memory:
         "falls": zero.clone(),
         "came_up": world > 0,
         "still_steps": world.clone(),
+        "low_steps": world.clone(),
         **ball_games.begin_possession(view),
     }
 
@@ -192,12 +205,17 @@ def advance(view: View, memory: Memory) -> Advance:
 
     # Who lies too long is put on its feet, a ball off the court or stuck is dropped inside.
     laid = ball_games.lying(view, memory, view.fallen())
+    if view.config.fall > 0.0:
+        terms["fall"] = -view.config.fall * (laid["falls"] - memory["falls"])
     edge = HALF_LENGTH - 2 * INSIDE, HALF_WIDTH - 2 * INSIDE
     move, down, _ = ball_games.get_up(view, laid["down"], *edge)
     still = (squared(velocity) < STILL_SPEED**2) & (ball[:, 2] > HIGH)
     still_steps = (memory["still_steps"] + 1.0).masked_fill(~still, 0.0)
     out = (ball[:, 0].abs() > HALF_LENGTH) | (ball[:, 1].abs() > HALF_WIDTH)
     out |= still_steps >= STILL_STEPS
+    low_steps = (memory["low_steps"] + 1.0).masked_fill(ball[:, 2] > LOW, 0.0)
+    if view.config.jump_ball > 0.0:
+        out |= low_steps * view.control_timestep > view.config.jump_ball - 1e-6
     edge = HALF_LENGTH - INSIDE, HALF_WIDTH - INSIDE
     move, ball_after = ball_games.drop_inside(view, out, *edge, DROP_HEIGHT, onto=move)
 
@@ -213,6 +231,7 @@ def advance(view: View, memory: Memory) -> Advance:
             "down": down,
             "came_up": came_up & ~out,
             "still_steps": still_steps.masked_fill(out, 0.0),
+            "low_steps": low_steps.masked_fill(out, 0.0),
             **held,
         },
         terms=terms,

@@ -338,6 +338,31 @@ def test_a_ball_that_lies_on_a_ring_is_dropped_below_it(speed, z, stuck):
         assert not pitch.advance().terminated.any()  # falling from there is no basket
 
 
+@pytest.mark.parametrize("seconds", [0.0, 0.5])
+def test_a_ball_on_the_floor_may_be_dropped_again(seconds):
+    """Rolling or not, after as long without leaving it; one that bounces is not."""
+    pitch = match(ball=(3.0, 2.0, 0.12), vel=(1.0, 0.0, 0.0), jump_ball=seconds)
+    wanted = [False] * 14 + [seconds > 0.0]
+    for again in range(2):
+        steps = [pitch.advance() for _ in range(15)]
+        assert [bool(s.move.mask[0]) for s in steps] == wanted, again
+    if seconds:
+        assert ball_after(pitch, steps[-1]) == pytest.approx((3.0, 2.0, 2.5))
+        assert not steps[-1].terminated.any()
+    for k in range(40):
+        pitch.ball((3.0, 2.0, 0.12 if k % 10 else 0.3))
+        assert not pitch.advance().move.mask.any()
+    with pytest.raises(ValueError, match="must not be negative"):
+        match(jump_ball=-1.0)
+
+
+def test_a_fall_costs_what_is_asked():
+    assert "fall" not in match().advance(down=(0,)).terms
+    pitch = match(fall=0.5)
+    costs = [pitch.advance(down=down).terms["fall"][0].tolist() for down in ((), (0,), (0, 1), ())]
+    assert costs == [[0.0, 0.0], [-0.5, 0.0], [0.0, -0.5], [0.0, 0.0]]
+
+
 def test_an_athlete_that_lies_is_put_on_its_feet_after_a_second():
     pitch = match()
     pitch.stand(0, 5.0, 1.0, 2.0, z=0.1)
