@@ -66,19 +66,16 @@ class SeenAs:
         for i, parent in enumerate(parents):  # a parent stands before its children
             if parent >= 0:
                 above[i] += above[parent]
-        above[:, 0] = 0.0  # the root is the origin
         self._above = tensor(above)
         self._parents = tensor(np.maximum(parents, 0), torch.long)
         self._offsets = tensor([link.offset for link in known.links])
         self._lower = known.standing_height() - body.standing_height()
         """What the root is higher by on the legs of the known body (m)."""
         here = {dof.name: i for i, dof in enumerate(body.dofs)}
-        shared = [i for i, dof in enumerate(known.dofs) if dof.name in here]
-        self._from = tensor(shared, torch.long)
-        self._to = tensor([here[known.dofs[i].name] for i in shared], torch.long)
-        self._ratio = tensor(known.action_scale()[shared]) / tensor(
-            body.action_scale()[[here[known.dofs[i].name] for i in shared]]
-        )
+        there = [i for i, dof in enumerate(known.dofs) if dof.name in here]
+        to = [here[known.dofs[i].name] for i in there]
+        self._from, self._to = tensor(there, torch.long), tensor(to, torch.long)
+        self._ratio = tensor(known.action_scale()[there] / body.action_scale()[to])
         self._dofs = body.num_dofs
 
     def state(self, obs: Tensor) -> Tensor:
