@@ -130,7 +130,7 @@ def summary_table(results: Sequence[Mapping[str, Any]]) -> str:
                 "; ".join(
                     f"{m} {_value(known[m][beside], known[m]['unit'])}" for m in ours if m in known
                 )
-                + (f" ({beside})" if beside != "PPO" else ""),
+                + (f" ({beside})" if known and beside != "PPO" else ""),
             ]
         )
     head = [

@@ -74,6 +74,13 @@ def test_a_method_stands_beside_the_papers_own(algo: str, height: str):
     assert f"height_1.0m {height}" in row.split("|")[-2]
 
 
+def test_a_task_that_the_paper_has_no_figures_of_stands_alone():
+    goals = {"goals_for": {"mean": 0.2, "ci95": [0.1, 0.3], "n": 9, "unit": "goals"}}
+    row = {"task": "soccer_1v1", "algo": "latent", "strength": "human", "engine": "mujoco"}
+    line = leaderboard.summary_table([{**row, "trials": 9, "metrics": goals}]).splitlines()[-1]
+    assert line.replace(" ", "").endswith("|goals_for0.2[0.1,0.3]goals||")
+
+
 def test_a_front_page_without_marks_changes_nothing(folder: Path):
     front = folder / "front.md"
     front.write_text("# Title\n")
