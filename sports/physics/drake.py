@@ -23,41 +23,20 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from pydrake.common.eigen_geometry import Quaternion
-from pydrake.geometry import (
-    GeometryId,
-)
-from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
-from pydrake.systems.framework import Context
 from torch import Tensor
 
 from sports import quaternion
 from sports.ball_law.compiled import for_cpu
-from sports.humanoid.drake_plant import (
-    OBJECT_DISSIPATION,
-    OBJECT_STIFFNESS,
-    DrakeHumanoid,
-    add_ground,
-    add_humanoid,
-    contact_properties,
-    filter_collisions,
-    rotate,
-    start_plant,
-)
+from sports.humanoid.drake_plant import DrakeHumanoid, rotate
 from sports.humanoid.mjcf import build_model
 from sports.physics.base import Geometry, PhysicsState, diverged
-from sports.physics.drake_objects import (
-    KICKED_STIFFNESS,
-    PlantObject,
-    add_kick_surfaces,
-    add_object,
-    floating,
-    separate_held,
-)
+from sports.physics.drake_calm import CalmBalls
+from sports.physics.drake_objects import floating
+from sports.physics.drake_scene import Forces, ScenePlant
 from sports.physics.game import build_game, has_game
-from sports.scene import GROUND, Scene
+from sports.scene import Scene
 
 MAX_TIMESTEP = 1.0 / 480.0
 """Largest time step (s) chosen on its own: standing joints then follow MuJoCo to 1e-3 rad."""
@@ -79,8 +58,10 @@ class DrakePhysics:
 
     ``timestep`` (s) must divide the scene's control time step; None takes the scene's time step
     divided by the smallest whole number that brings it to 1/480 s or below, with a ball that
-    bounces to 1/960 s, with one that is kicked to 1/3840 s, with a javelin to 1/1920 s. Raises
-    ValueError for a time step that does not divide.
+    bounces to 1/960 s, with one that is kicked to 1/3840 s, with a javelin to 1/1920 s. Where
+    nobody is near a ball that is kicked, control steps are made at 1/480 s
+    (:mod:`sports.physics.drake_calm`), unless ``timestep`` is given. Raises ValueError for a time
+    step that does not divide.
     """
 
     engine = "drake"
@@ -98,52 +79,24 @@ class DrakePhysics:
         self.num_worlds = n = num_worlds
         self.device = torch.device("cpu")
         self.geometry = Geometry(scene.body, self.device)
-        self.substeps = _substeps(scene, timestep)
-        self.timestep = scene.control_timestep / self.substeps
+        self.timestep = _step_of(scene, timestep)
 
-        builder, plant, scene_graph = start_plant(self.timestep, contact_approximation)
-        self.plant = plant
-        ground = add_ground(plant, properties=contact_properties(scene.ground_friction))
-        self._humanoids = [
-            add_humanoid(plant, scene.body, f"agent{a}") for a in range(scene.num_agents)
-        ]
-        points: list[GeometryId] = []
-        shapes: list[GeometryId] = []
-        self._free: list[PlantObject] = []
-        self._fixtures: list[PlantObject] = []
-        for obj in scene.objects:
-            stiffness, losses = OBJECT_STIFFNESS, OBJECT_DISSIPATION
-            if scene.bouncing and obj.motion != "free":
-                losses = 0.0  # a wall must leave a ball the restitution that it has
-                stiffness = KICKED_STIFFNESS if scene.kicked else stiffness
-            added = add_object(plant, obj, self.timestep, losses, points, shapes, stiffness)
-            (self._fixtures if added.frame is not None else self._free).append(added)
-        self._doubles: dict[GeometryId, GeometryId] = {}
-        if scene.kicked:
-            names = [ball.name for ball in scene.kicked]
-            balls = [o for o in self._free if o.name in names]
-            friction = scene.ground_friction
-            self._doubles = add_kick_surfaces(
-                plant, scene_graph, self._humanoids, ground, friction, points, shapes, balls
-            )
-        plant.Finalize()
-        filter_collisions(scene_graph, self._humanoids, [ground], points, shapes)
-        separate_held(scene_graph, self._humanoids, shapes)
-        self.diagram = builder.Build()
-        self._roots = [self.diagram.CreateDefaultContext() for _ in range(n)]
-        self._contexts = [plant.GetMyMutableContextFromRoot(root) for root in self._roots]
-        self._contact_port = plant.get_contact_results_output_port()
-        self._targets = [plant.get_desired_state_input_port(h.instance) for h in self._humanoids]
-        self._mocap_rows = {o.name: k for k, o in enumerate(scene.mocap_objects)}
-        self._index_contacts()
+        self._plant = fine = ScenePlant(scene, n, self.timestep, contact_approximation)
+        self._calm = None
+        if timestep is None and scene.kicked and not has_game(scene):
+            step = _at_most(scene, MAX_TIMESTEP)
+            coarse = ScenePlant(scene, n, step, contact_approximation)
+            self._calm = CalmBalls(scene, fine, coarse)
+        self.plant, self.substeps = fine.plant, fine.substeps
+        plant = fine.plant
+        self._humanoids, self._free = fine.humanoids, fine.free
         self._qpos, self._qvel = np.zeros((n, scene.nq)), np.zeros((n, scene.nv))
         self._add_game()
 
         agents, links, free = scene.num_agents, scene.body.num_links, len(self._free)
-        self._links = [link for h in self._humanoids for link in h.links]
         self._q = np.zeros((n, plant.num_positions()))
         self._v = np.zeros((n, plant.num_velocities()))
-        self._mocap = np.zeros((n, len(self._mocap_rows), 3))
+        self._mocap = np.zeros((n, len(scene.mocap_objects), 3))
         bodies = agents * links + free
         self._pos, self._quat = np.zeros((n, bodies, 3)), np.zeros((n, bodies, 4))
         self._lin, self._ang = np.zeros((n, bodies, 3)), np.zeros((n, bodies, 3))
@@ -202,35 +155,42 @@ class DrakePhysics:
         return self.geometry.extent(self.body_pos, self.body_quat, direction)
 
     def close(self) -> None:
-        self._contexts, self._roots = [], []
+        for plant in self._all_plants():
+            plant.close()
 
     # ---- one world ------------------------------------------------------------------------
 
     def _step_world(self, world: int, targets: np.ndarray) -> bool:
         """Advances one control step; False if the solver failed or the state is not finite."""
-        for forces in (self._ground, self._pair, self._others):
-            forces[world : world + 1] = 0.0
         if not np.isfinite(targets).all():
+            self._forget_forces(world)
             return False
-        root, context = self._roots[world], self._contexts[world]
-        n = self.scene.body.num_dofs
-        for a, port in enumerate(self._targets):
-            wanted = np.zeros(2 * n)
-            wanted[:n] = targets[a * n : (a + 1) * n]
-            port.FixValue(context, wanted)
+        fine, calm = self._plant, self._calm
+        before = fine.state(world)
+        if calm is not None and not calm.soon(*before, self._pos[world], self._lin[world]):
+            calm.coarse.set_state(world, *calm.to_coarse(*before))
+            if self._advance(calm.coarse, world, targets):
+                fine.set_state(world, *calm.to_fine(*calm.coarse.state(world)))
+                return True
+        return self._advance(fine, world, targets)
+
+    def _advance(self, plant: ScenePlant, world: int, targets: np.ndarray) -> bool:
+        """The same in one of the plants; False also if in the coarse one a ball met more than the
+        ground it rolls on."""
+        self._forget_forces(world)
+        plant.aim(world, targets)
+        calm = self._calm if plant is not self._plant else None
         game, state, law = self._game, (self._qpos, self._qvel), self._law
         if game is not None and law is not None:
             self._read_states(slice(world, world + 1))
             law.begin_world(game, world, *state)
-        for _ in range(self.substeps):
+        for _ in range(plant.substeps):
             if game is not None and law is not None:
                 law.push_world(game, world, self.timestep, *state)
                 self._push(world)
-            try:
-                self.diagram.ExecuteForcedEvents(root, publish=False)
-            except RuntimeError:  # the contact solver or a NaN check gave up on this world
+            if not plant.advance(world) or (calm is not None and calm.meets(world)):
                 return False
-            self._collect_contacts(world, context)
+            self._keep_forces(world, plant.forces(world))
             if game is not None and law is not None:
                 self._read_states(slice(world, world + 1))
                 law.finish_world(game, world, self.timestep, *state)
@@ -241,11 +201,27 @@ class DrakePhysics:
                         self._put(world, self._dragged)
         if self.scene.ball is not None:
             self._put(world, [self.scene.ball.name])
-        return bool(np.isfinite(self.plant.GetPositionsAndVelocities(context)).all())
+        return bool(np.isfinite(np.concatenate(plant.state(world))).all())
+
+    def _all_plants(self) -> list[ScenePlant]:
+        return [self._plant] if self._calm is None else [self._plant, self._calm.coarse]
+
+    def _forget_forces(self, world: int) -> None:
+        for forces in (self._ground, self._pair, self._others):
+            forces[world : world + 1] = 0.0
+
+    def _keep_forces(self, world: int, found: Forces) -> None:
+        """Keeps, per link and per pair, the largest net force of the substeps."""
+        for kept, forces in ((self._ground, found.ground), (self._others, found.others)):
+            for link, force in forces.items():
+                if force @ force > kept[world, link] @ kept[world, link]:
+                    kept[world, link] = force
+        for k, force in found.pairs.items():
+            self._pair[world, k] = np.maximum(self._pair[world, k], np.linalg.norm(force))
 
     def _place(self, world: int, qpos: np.ndarray, qvel: np.ndarray, mocap: np.ndarray) -> None:
         """Sets one world's state and fixtures; contact forces become zero."""
-        scene, context = self.scene, self._contexts[world]
+        scene = self.scene
         q, v = np.zeros(self.plant.num_positions()), np.zeros(self.plant.num_velocities())
         for a, humanoid in enumerate(self._humanoids):
             q[humanoid.q_index], v[humanoid.v_index] = humanoid.to_drake(
@@ -258,16 +234,11 @@ class DrakePhysics:
             start, start_v = floating(obj.joint)
             q[start : start + 7] = (*quat, *p)
             v[start_v : start_v + 6] = (*rotate(quat, spin), *linear)
-        self.plant.SetPositions(context, q)
-        self.plant.SetVelocities(context, v)
-        for obj in self._fixtures:
-            row = self._mocap_rows.get(obj.name)
-            if row is not None and obj.frame is not None:
-                X_WF = RigidTransform(Quaternion(np.array(obj.quat)), mocap[row])
-                obj.frame.SetPoseInParentFrame(context, X_WF)
+        self._plant.set_state(world, q, v)
+        for plant in self._all_plants():
+            plant.place_fixtures(world, mocap)
         self._mocap[world] = mocap
-        for forces in (self._ground, self._pair, self._others):
-            forces[world : world + 1] = 0.0
+        self._forget_forces(world)
 
     # ---- the ball law ---------------------------------------------------------------------
 
@@ -318,13 +289,12 @@ class DrakePhysics:
             force.F_Bq_W = SpatialForce(tau=row[3:], f=row[:3])
             forces.append(force)
         port = self.plant.get_applied_spatial_force_input_port()
-        port.FixValue(self._contexts[world], forces)
+        port.FixValue(self._plant.contexts[world], forces)
 
     def _put(self, world: int, names: Sequence[str]) -> None:
         """Puts objects where the law has them. Of the ball the plant does not need to know in
         between: nothing in it touches the ball."""
-        context = self._contexts[world]
-        q, v = self.plant.GetPositions(context), self.plant.GetVelocities(context)
+        q, v = self._plant.state(world)
         for obj in self._free:
             if obj.name in names:
                 p, quat = np.split(self._qpos[world, self.scene.object_qpos(obj.name)], [3])
@@ -332,87 +302,15 @@ class DrakePhysics:
                 start, start_v = floating(obj.joint)
                 q[start : start + 7] = (*quat, *p)
                 v[start_v : start_v + 6] = (*rotate(quat, spin), *linear)
-        self.plant.SetPositions(context, q)
-        self.plant.SetVelocities(context, v)
-
-    def _index_contacts(self) -> None:
-        """Tables from Drake's body indices to links and to the scene's pairs."""
-        names: dict[str, list[int]] = {GROUND: [0]}  # nothing else is on the world body
-        self._link_of: dict[int, int] = {}
-        self._shape_of: dict[GeometryId, int] = {}
-        for a, humanoid in enumerate(self._humanoids):
-            for i, link in enumerate(humanoid.links):
-                index = int(link.index())
-                self._link_of[index] = a * self.scene.body.num_links + i
-                names.setdefault(f"agent{a}", []).append(index)
-                name = f"agent{a}/{self.scene.body.link_names[i]}"
-                names[name] = [index]
-                for k, shape in enumerate(humanoid.shapes[i]):
-                    # A shape of its own gets a number that no body has.
-                    names[f"{name}:{k}"] = [-1 - len(self._shape_of)]
-                    self._shape_of[shape] = names[f"{name}:{k}"][0]
-            for link in self.scene.body.link_names:
-                beyond = self.scene.body.subtree(link)
-                names[f"agent{a}/{link}/"] = [names[f"agent{a}/{b}"][0] for b in beyond]
-        for double, shape in self._doubles.items():
-            self._shape_of[double] = self._shape_of[shape]
-        for obj in [*self._free, *self._fixtures]:
-            names[obj.name] = [int(obj.rigid.index())]
-        self._pairs_of: dict[tuple[int, int], list[tuple[int, float]]] = {}
-        for k, (left, right) in enumerate(self.scene.contact_pairs):
-            for side in (left, right):
-                if side not in names:
-                    raise ValueError(f"scene '{self.scene.name}' has no contact side '{side}'")
-            for i in names[left]:
-                for j in names[right]:
-                    self._pairs_of.setdefault((i, j), []).append((k, -1.0))
-                    self._pairs_of.setdefault((j, i), []).append((k, 1.0))
-
-    def _collect_contacts(self, world: int, context: Context) -> None:
-        """Keeps, per link and per pair, the largest net force of the substeps."""
-        results = self._contact_port.Eval(context)
-        count = results.num_point_pair_contacts()
-        if count == 0:
-            return
-        ground: dict[int, np.ndarray] = {}
-        pairs: dict[int, np.ndarray] = {}
-        others: dict[int, np.ndarray] = {}
-        for i in range(count):
-            info = results.point_pair_contact_info(i)
-            body_a, body_b = int(info.bodyA_index()), int(info.bodyB_index())
-            f_Bc_W = info.contact_force()
-            if body_a == 0 and body_b in self._link_of:
-                link = self._link_of[body_b]
-                ground[link] = ground.get(link, 0.0) + f_Bc_W
-            elif body_b == 0 and body_a in self._link_of:
-                link = self._link_of[body_a]
-                ground[link] = ground.get(link, 0.0) - f_Bc_W
-            elif self.scene.link_contacts:
-                for body, force in ((body_b, f_Bc_W), (body_a, -f_Bc_W)):
-                    link = self._link_of.get(body)
-                    if link is not None:
-                        others[link] = others.get(link, 0.0) + force
-            met = info.point_pair()
-            sides_a = body_a, self._shape_of.get(met.id_A, body_a)
-            sides_b = body_b, self._shape_of.get(met.id_B, body_b)
-            for sides in dict.fromkeys((a, b) for a in sides_a for b in sides_b):
-                for k, sign in self._pairs_of.get(sides, ()):
-                    pairs[k] = pairs.get(k, 0.0) + sign * f_Bc_W
-        for kept, found in ((self._ground, ground), (self._others, others)):
-            for link, force in found.items():
-                if force @ force > kept[world, link] @ kept[world, link]:
-                    kept[world, link] = force
-        for k, force in pairs.items():
-            self._pair[world, k] = np.maximum(self._pair[world, k], np.linalg.norm(force))
+        self._plant.set_state(world, q, v)
 
     # ---- tensors --------------------------------------------------------------------------
 
     def _read_states(self, worlds: slice = slice(None)) -> None:
         """qpos and qvel of worlds in MuJoCo's convention; their tensors, if of all worlds."""
-        scene, plant = self.scene, self.plant
+        scene = self.scene
         for world in range(self.num_worlds)[worlds]:
-            self._q[world] = plant.GetPositions(self._contexts[world])
-            self._v[world] = plant.GetVelocities(self._contexts[world])
+            self._q[world], self._v[world] = self._plant.state(world)
         own_q, own_v = self._q[worlds], self._v[worlds]
         qpos, qvel = self._qpos[worlds], self._qvel[worlds]
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -437,9 +335,8 @@ class DrakePhysics:
         """Brings every tensor of the protocol up to date with the contexts."""
         self._read_states()
         plant, n = self.plant, self.num_worlds
-        rigids = [*self._links, *(obj.rigid for obj in self._free)]
-        for world, context in enumerate(self._contexts):
-            for i, rigid in enumerate(rigids):
+        for world, context in enumerate(self._plant.contexts):
+            for i, rigid in enumerate(self._plant.bodies):
                 X_WB = plant.EvalBodyPoseInWorld(context, rigid)
                 V_WB = plant.EvalBodySpatialVelocityInWorld(context, rigid)
                 self._pos[world, i] = X_WB.translation()
@@ -465,22 +362,27 @@ class DrakePhysics:
         self.pair_force = tensor(self._pair)
 
 
-def _substeps(scene: Scene, timestep: float | None) -> int:
-    """Drake steps in one control step."""
+def _step_of(scene: Scene, timestep: float | None) -> float:
+    """The time step (s) that a scene is stepped with, or one that is asked for."""
     if timestep is None:
         largest = BOUNCE_TIMESTEP if scene.bouncing else MAX_TIMESTEP
         if scene.kicked:
             largest = KICK_TIMESTEP
         if any(o.holdable and o.restitution is None for o in scene.objects):
             largest = HOLD_TIMESTEP
-        return scene.substeps * math.ceil(scene.timestep / largest - 1e-9)
+        return _at_most(scene, largest)
     count = round(scene.control_timestep / timestep) if timestep > 0 else 0
     if count < 1 or abs(count * timestep - scene.control_timestep) > 1e-9:
         raise ValueError(
             f"the Drake time step must divide the control time step "
             f"{scene.control_timestep:.6g} s, which {timestep:.6g} s does not"
         )
-    return count
+    return scene.control_timestep / count
+
+
+def _at_most(scene: Scene, largest: float) -> float:
+    """The scene's time step divided by the smallest whole number that brings it to ``largest``."""
+    return scene.timestep / math.ceil(scene.timestep / largest - 1e-9)
 
 
 __all__ = ["MAX_TIMESTEP", "DrakeHumanoid", "DrakePhysics"]

@@ -18,6 +18,7 @@ from pydrake.geometry import (
     GeometrySet,
     ProximityProperties,
     SceneGraph,
+    Sphere,
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
@@ -46,6 +47,8 @@ KICK_LOSS = 1.51
 at 3 to 20 m/s and 1/960 to 1/7680 s: restitution 0.79 to 0.81 where 0.8 is asked for)."""
 KICKED_STIFFNESS = 1e8
 """Of those surfaces (N/m): all of the spring is the ball's."""
+GRAVITY = 9.81
+"""m/s^2, Drake's own"""
 _HELD = "held"
 
 
@@ -60,6 +63,10 @@ class PlantObject:
     joint: QuaternionFloatingJoint | None
     """Of a free object with the world: q = [quaternion wxyz, p_WB], v = [w_WB_W, v_WBo_W]."""
     quat: tuple[float, float, float, float]
+    stiffness: float = OBJECT_STIFFNESS
+    """Of its contacts (N/m); a ball's follows from its restitution and the time step."""
+    reach: float = 0.0
+    """Of a ball that is kicked: height (m) of its centre at which it begins to touch the ground."""
 
 
 def add_object(
@@ -74,7 +81,7 @@ def add_object(
     """Adds a scene object; its geometries are appended to ``points`` and ``shapes``."""
     instance = plant.AddModelInstance(obj.name)
     rigid = plant.AddRigidBody(obj.name, instance, link_inertia(obj.shapes))
-    frame, joint = None, None
+    frame, joint, reach = None, None, 0.0
     if obj.motion in ("free", "ball"):
         damping = obj.rolling_damping() if obj.rolling else 0.0
         joint = QuaternionFloatingJoint(
@@ -88,7 +95,11 @@ def add_object(
     if obj.motion == "ball":  # touches what the ball law says
         return PlantObject(obj.name, rigid, frame, joint, obj.quat)
     if obj.restitution is not None:
-        own = _add_ball(plant, rigid, obj, timestep)
+        (sphere,) = obj.shapes
+        stiffness = _ball_stiffness(obj, timestep)
+        sinks = 0.0 if obj.holdable else sphere.mass * GRAVITY / stiffness
+        reach = sphere.size[0] + sinks
+        own = _add_ball(plant, rigid, obj, stiffness, sinks)
     else:
         own = add_shapes(
             plant,
@@ -103,20 +114,27 @@ def add_object(
         )
     points.extend(own[0])
     shapes.extend(own[1])
-    return PlantObject(obj.name, rigid, frame, joint, obj.quat)
+    return PlantObject(obj.name, rigid, frame, joint, obj.quat, stiffness, reach)
+
+
+def _ball_stiffness(ball: SceneObject, timestep: float) -> float:
+    """N/m with which a ball has its restitution at that time step (s)."""
+    assert ball.restitution is not None
+    loss = BOUNCE_LOSS if ball.holdable else KICK_LOSS
+    frequency = -math.log(ball.restitution) / (loss * timestep)
+    return sum(shape.mass for shape in ball.shapes) * frequency**2
 
 
 def _add_ball(
-    plant: MultibodyPlant, rigid: RigidBody, ball: SceneObject, timestep: float
+    plant: MultibodyPlant, rigid: RigidBody, ball: SceneObject, stiffness: float, sinks: float
 ) -> tuple[list[GeometryId], list[GeometryId]]:
-    """A ball that bounces: (sphere for the ground, sphere for the rest). What hands can hold has
-    one more for athletes alone, which is firm; then nothing but the ground rubs on the others."""
-    assert ball.restitution is not None
+    """A ball that bounces: (sphere for the ground, sphere for the rest). The former is larger by
+    what it ``sinks`` (m), so that at rest and rolling its centre is as high as it is wide. What
+    hands can hold has one more for athletes alone, which is firm; then nothing but the ground rubs
+    on the others."""
     (sphere,) = ball.shapes
-    loss = BOUNCE_LOSS if ball.holdable else KICK_LOSS
-    frequency = -math.log(ball.restitution) / (loss * timestep)
-    stiffness = sphere.mass * frequency**2
-    X_BS, geometry = drake_shape(sphere)
+    X_BS, usual = drake_shape(sphere)
+    low = Sphere(sphere.size[0] + sinks)
     soft, firm = (stiffness, 0.0), (HOLD_STIFFNESS, OBJECT_DISSIPATION)
     surfaces = [("ground", ball.friction, soft), ("rest", ball.grip, soft)]
     if ball.holdable:
@@ -126,7 +144,7 @@ def _add_ball(
         plant.RegisterCollisionGeometry(
             rigid,
             X_BS,
-            geometry,
+            low if against == "ground" else usual,
             f"{ball.name}_{against}",
             contact_properties(friction / (2.0 - friction), *compliance),
         )

@@ -119,7 +119,7 @@ def test_hands_press_in_drake_as_in_mujoco(name):
     for _ in range(15):
         physics.step(ctrl)
     plant = physics.plant
-    results = plant.get_contact_results_output_port().Eval(physics._contexts[0])
+    results = plant.get_contact_results_output_port().Eval(physics._plant.contexts[0])
     infos = [results.point_pair_contact_info(i) for i in range(results.num_point_pair_contacts())]
     held = int(plant.GetBodyByName(HELD[name].name).index())
     own = [i for i in infos if held in (int(i.bodyA_index()), int(i.bodyB_index()))]
