@@ -31,8 +31,11 @@ class LatentConfig:
     span: float = 2.5
     """Standard deviations of the prior that a bounded policy reaches, and a scaled one by a = 1."""
     arm_residual: float = 0.0
-    """Radians that the policy may add to the targets of the arm that holds the tool; 0 for none.
-    0.2 helps in racket sports."""
+    """Radians that the policy may add to the targets of the arm that holds the tool, or of those
+    whose hands begin with something in them; 0 for none. 0.2 helps in racket sports."""
+    hands: bool = False
+    """Give the policy one number more for each hand with fingers, with which it opens: up to 0.2
+    the fingers keep the task's grasp, from 1 on they are straight."""
 
     def __post_init__(self) -> None:
         if self.span <= 0.0 or not 0.0 <= self.arm_residual <= math.pi:
@@ -43,7 +46,10 @@ def arm_dofs(body: Body, tools: tuple[str, ...]) -> list[int]:
     """Indices of the hinges of the arms that hold the ``tools`` (links), from the shoulder blade
     on, fingers left out. Raises ValueError without a tool."""
     if not tools:
-        raise ValueError("the task has no tool, so no arm for --latent.arm-residual: leave it out")
+        raise ValueError(
+            "the task has no tool and nothing in hand, so no arm for --latent.arm-residual: leave "
+            "it out"
+        )
     children = [link.parent for link in body.links]
     arm: set[str] = set()
     for tool in tools:
@@ -53,6 +59,33 @@ def arm_dofs(body: Body, tools: tuple[str, ...]) -> list[int]:
             arm.add(at)
             at = body.links[body.link_index(at)].parent
     return [i for i, dof in enumerate(body.dofs) if dof.link in arm]
+
+
+def holding(scene: Scene) -> tuple[str, ...]:
+    """The hands (links) that begin with something in them."""
+    held = {dof.link for dof in scene.body.dofs if dof.name in scene.steady}
+    return tuple(name for name in scene.body.link_names if name in held & {"L_Wrist", "R_Wrist"})
+
+
+KEEP = 0.2
+"""Up to here a hand's number leaves the grasp as it is: the noise of exploring drops nothing."""
+
+
+def finger_dofs(body: Body) -> list[list[int]]:
+    """Indices of the fingers' hinges, hand by hand. Raises ValueError for a body without any."""
+    hands: dict[str, list[int]] = {}
+    for i, dof in enumerate(body.dofs):
+        if is_finger(dof.link):
+            at = dof.link
+            while is_finger(at):
+                at = body.links[body.link_index(at)].parent or ""
+            hands.setdefault(at, []).append(i)
+    if not hands:
+        raise ValueError(
+            f"the athlete of this task (body '{body.name}') has no fingers for --latent.hands: "
+            "leave it out"
+        )
+    return list(hands.values())
 
 
 def _seen_as(prior: LatentPrior, body: Body, device: torch.device | str) -> SeenAs | None:
@@ -105,12 +138,18 @@ class LatentActions:
         self._offset = tensor(offset / scale)
         # Fingers keep the task's grasp: action 0 is its pose.
         self._free = tensor([0.0 if is_finger(dof.link) else 1.0 for dof in body.dofs])
-        arm = arm_dofs(body, tools) if config.arm_residual > 0.0 else []
+        arm = arm_dofs(body, tools or holding(scene)) if config.arm_residual > 0.0 else []
         spread = torch.zeros(len(arm), body.num_dofs)
         spread[torch.arange(len(arm)), arm] = 1.0
         self._spread = spread.to(device) * config.arm_residual / tensor(scale)
-        self.size = prior.latent + len(arm)
-        """Numbers of the policy's action: the latent's, then the arm's hinges."""
+        hands = finger_dofs(body) if config.hands else []
+        opens = torch.zeros(len(hands), body.num_dofs, device=device)
+        for hand, fingers in enumerate(hands):
+            opens[hand, fingers] = -self._offset[fingers]  # straight is the angle 0
+        self._opens = opens
+        self._arm = slice(prior.latent, prior.latent + len(arm))
+        self.size = self._arm.stop + len(hands)
+        """Numbers of the policy's action: the latent's, then the arm's hinges, then the hands."""
 
     @property
     def card(self) -> dict[str, Any]:
@@ -144,5 +183,6 @@ class LatentActions:
         decoded = self.prior.decode(state, self._latent(state, action))
         if self._seen is not None:
             decoded = self._seen.targets(decoded)
-        arm = torch.tanh(action[..., self.prior.latent :].float()) @ self._spread
-        return self._free * (decoded - self._offset) + arm
+        arm = torch.tanh(action[..., self._arm].float()) @ self._spread
+        open_ = (action[..., self._arm.stop :].float() - KEEP) / (1.0 - KEEP)
+        return self._free * (decoded - self._offset) + arm + open_.clamp(0.0, 1.0) @ self._opens

@@ -8,10 +8,10 @@ import math
 import pytest
 import torch
 
-from rl.latent_action import LatentActions, LatentConfig, arm_dofs
+from rl.latent_action import LatentActions, LatentConfig, arm_dofs, finger_dofs, holding
 from rl.policy import Policy, PolicyError, load_policy
 from rl.prior import PriorError
-from sports.env import make_env
+from sports.env import make_env, make_scene
 from sports.humanoid.body import is_finger, load_body
 from sports.registry import get_task
 from tests.rl.latent_made import made_prior
@@ -117,12 +117,15 @@ def test_the_arm_with_the_tool_may_be_moved_a_little():
         torch.testing.assert_close(change, expected.expand(2, 1, 69), atol=1e-5, rtol=0)
     env.close()
     plain_task = make_env("hurdling", num_worlds=1)
-    with pytest.raises(ValueError, match="no tool, so no arm"):
+    with pytest.raises(ValueError, match="nothing in hand, so no arm"):
         layer_of(plain_task, arm_residual=0.2)
     plain_task.close()
     # The fencer holds the sword in the hand, further down the same arm; fingers do not count.
     smpl = load_body("smpl")
     assert arm_dofs(smpl, ("R_Hand",)) == arm_dofs(smpl, ("R_Wrist",))
+    assert holding(env.physics.scene) == () == holding(plain_task.physics.scene)
+    assert holding(make_scene("javelin")) == ("R_Wrist",)
+    assert holding(make_scene("free_throw")) == ("L_Wrist", "R_Wrist")
     fingers = load_body("smplx")
     assert not any(is_finger(fingers.dofs[i].link) for i in arm_dofs(fingers, ("R_Wrist",)))
     assert len(arm_dofs(fingers, ("R_Wrist",))) == 12
@@ -163,3 +166,47 @@ def test_a_policy_without_its_layer_is_not_played():
     with pytest.raises(PolicyError, match="acts through another latent prior"):
         stranger._check_latent(env)
     env.close()
+
+
+def test_a_hand_opens_and_lets_go():
+    """Two numbers, right and left apart; with the hand open the javelin falls out of it."""
+    env, prior = make_env("javelin", num_worlds=3, training=False), made_prior("smplx")
+    layer = layer_of(env, prior, hands=True)
+    env.act_through(layer)
+    body = env.physics.scene.body
+    left, right = finger_dofs(body)
+    assert {body.dofs[i].link[0] for i in left} == {"L"}
+    assert {body.dofs[i].link[0] for i in right} == {"R"}
+    assert len(left) == len(right) == 45
+    assert layer.size == env.action_size == 6 + 2
+    obs = env.reset()
+    action = torch.zeros(3, 1, 8)
+    action[1, 0, 6], action[2, 0, 7] = 0.6, 5.0  # the left half open, the right one wide
+    plain = layer(obs, torch.zeros(3, 1, 8))
+    changed = (layer(obs, action) - plain) * env.action_scale
+    grasp = env.action_offset
+    assert torch.equal(changed[0], torch.zeros(1, body.num_dofs))
+    for world, own, other, share in ((1, left, right, 0.5), (2, right, left, 1.0)):
+        torch.testing.assert_close(changed[world, 0, own], -share * grasp[own], atol=1e-6, rtol=0)
+        assert float(changed[world, 0, other].abs().max()) == 0.0
+    action[1, 0, 6] = 0.2  # not yet
+    assert torch.equal(layer(obs, action)[1], plain[1])
+    # The right hand holds the javelin, which is tossed up: only the open hand lets it go.
+    action[1, 0, 6] = 1.0
+    ctrl = (grasp + (layer(obs, action) - plain) * env.action_scale)[:, 0]
+    physics, up = env.physics, env.physics.scene.object_qvel("javelin").start + 2
+    for _ in range(4):
+        physics.step(ctrl)
+    before = physics.object_pos[:, 0, 2].clone()
+    qvel = physics.qvel.clone()
+    qvel[:, up] = 2.0
+    physics.move(torch.ones(3, dtype=torch.bool), physics.qpos, qvel)
+    for _ in range(5):
+        physics.step(ctrl)
+    rose = (physics.object_pos[:, 0, 2] - before).tolist()
+    assert max(rose[:2]) < 0.04 < 0.08 < rose[2]
+    env.close()
+    plain_task = make_env("hurdling", num_worlds=1)
+    with pytest.raises(ValueError, match="has no fingers for"):
+        layer_of(plain_task, hands=True)
+    plain_task.close()
