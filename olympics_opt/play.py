@@ -97,10 +97,11 @@ def play(
     record_worlds: tuple[int, ...] = (),
     label: str = "",
     physics_options: dict[str, Any] | None = None,
+    parts: Path | None = None,
 ) -> EvaluationResult:
     """``rl.evaluate.evaluate`` with a line of progress; its errors and its result.
 
-    ``processes`` is for Drake, which steps its worlds one after another.
+    ``processes`` is for Drake, which steps its worlds one after another; ``parts`` too.
     """
     from rl.evaluate import evaluate
     from sports.registry import get_task
@@ -122,6 +123,7 @@ def play(
             record_worlds=record_worlds,
             processes=processes,
             progress=lambda done, total: bar.show(f"{done} of {total} trials", done, total),
+            parts=parts,
         )
         metrics = played.result["metrics"]
         name = "success" if "success" in metrics else get_task(task).main_metric
@@ -133,6 +135,7 @@ def play(
 
 def run_evaluate(config: Evaluate) -> int:
     """The command: prints the metrics and writes the result schema."""
+    from rl.kept_shares import forget
     from rl.worlds import engine_options, mistakes
 
     trials = asked(config)
@@ -146,6 +149,7 @@ def run_evaluate(config: Evaluate) -> int:
 
         reference = load_reference([config.likeness])
     worlds = tuple(range(SHOWN)) if reference is not None else ()
+    parts = config.out.with_name(f"{config.out.name}.parts")
     played = play(
         **trials,
         engine=config.engine,
@@ -153,12 +157,14 @@ def run_evaluate(config: Evaluate) -> int:
         record_worlds=worlds,
         timestep_divisor=config.timestep_divisor,
         physics_options=engine_options(config, config.seed),
+        parts=parts,
     )
     print_metrics(played.result)
     print_training_step(config)
     if reference is not None:
         _add_likeness(config, played, reference)
     print(f"wrote {atomic.write_json(config.out, played.result)}")
+    forget(parts)
     return 0
 
 

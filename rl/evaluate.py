@@ -22,6 +22,7 @@ from scipy import stats
 
 from rl import provenance
 from rl.host import RANK_STEP
+from rl.kept_shares import KeptShares
 from rl.policy import Policy, as_trained, load_policy
 from rl.recording import Recording
 from rl.trials import Played, Share, play_share, ranked, standing_starts
@@ -82,6 +83,7 @@ def evaluate(
     record_worlds: tuple[int, ...] = (),
     processes: int | None = None,
     progress: Progress | None = None,
+    parts: Path | None = None,
 ) -> EvaluationResult:
     """Plays ``trials`` episodes and summarises the task's metrics.
 
@@ -106,6 +108,9 @@ def evaluate(
         processes: for drake, which steps worlds in sequence; None for one per core. The trials
             are the same whatever their number.
         progress: called with (trials done, trials).
+        parts: a folder for the shares of Drake's trials that are finished, so that the same
+            evaluation, begun again after it was stopped, goes on (``rl.kept_shares.forget`` removes
+            them); None for none. Trials with recordings are played anew.
 
     Raises ValueError for an unknown task or option and PolicyError for a policy that does not
     fit, RuntimeError for an engine that cannot run here.
@@ -147,7 +152,8 @@ def evaluate(
         )
         for i, size in enumerate(sizes)
     ]
-    played = _run(policy, shares, workers, trials, progress)
+    kept = KeptShares(parts if engine == "drake" else None, policy)
+    played = _run(policy, shares, workers, trials, progress, kept)
     values = {name: np.concatenate([p.trials[name] for p in played]) for name in played[0].trials}
     recordings = _choose(task, values, played, record > 0, record_worlds)
     units = get_task(task).metrics
@@ -219,25 +225,36 @@ def _sizes(trials: int, worlds: int) -> list[int]:
 
 
 def _run(
-    policy: Policy, shares: list[Share], workers: int, trials: int, progress: Progress | None
+    policy: Policy,
+    shares: list[Share],
+    workers: int,
+    trials: int,
+    progress: Progress | None,
+    parts: KeptShares,
 ) -> list[Played]:
-    """Plays them here, or in processes of their own."""
+    """Plays them here, or in processes of their own; those that ``parts`` has are done."""
     report = progress or (lambda done, total: None)
+    found = {i: parts.find(share) for i, share in enumerate(shares)}
+    played = {i: p for i, p in found.items() if p is not None}
+    done = sum(shares[i].trials for i in played)
+    report(done, trials)
+    missing = [i for i in range(len(shares)) if i not in played]
     if workers == 1:
-        here, before = [], 0
-        for share in shares:
-            here.append(play_share(policy, share, lambda done, n=before: report(n + done, trials)))
-            before += share.trials
-        return here
-    played: dict[int, Played] = {}
+        for i in missing:
+            played[i] = play_share(policy, shares[i], lambda k, n=done: report(n + k, trials))
+            parts.keep(shares[i], played[i])
+            done += shares[i].trials
+        return [played[i] for i in range(len(shares))]
     context = multiprocessing.get_context("spawn")
-    report(0, trials)
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool:
-        futures = {pool.submit(play_share, policy, share): i for i, share in enumerate(shares)}
+        futures = {pool.submit(play_share, policy, shares[i]): i for i in missing}
         try:
             for future in as_completed(futures):
-                played[futures[future]] = future.result()
-                report(sum(shares[i].trials for i in played), trials)
+                i = futures[future]
+                played[i] = future.result()
+                parts.keep(shares[i], played[i])
+                done += shares[i].trials
+                report(done, trials)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

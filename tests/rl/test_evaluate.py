@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from rl.evaluate import EvaluationResult, evaluate, interval
+from rl.kept_shares import forget
 from rl.policy import load_policy
 from rl.recording import Recording
-from rl.trials import Share, opened, ranked
+from rl.trials import Share, opened, play_share, ranked
 from sports.env import make_env
 from sports.registry import get_task
 
@@ -296,3 +298,49 @@ def test_how_many_processes_play_drake_does_not_change_its_trials(drake_trials):
     np.testing.assert_array_equal(returns, drake_trials.trials["return"])
     assert len(set(returns.tolist())) == 6  # a start of its own for each
     assert done == sorted(done) and done[-1] == 6
+
+
+def test_an_evaluation_that_was_stopped_goes_on(drake_trials, tmp_path, monkeypatch):
+    """Killed in its third share: two are not played again, and the result is that of one go."""
+    module, play = sys.modules["rl.evaluate"], play_share
+    played = []
+
+    def counted(policy, share, report=None):
+        if len(played) == 2:
+            raise KeyboardInterrupt
+        played.append(share.seed)
+        return play(policy, share, report)
+
+    def again(seed=0, **options):
+        options = {"engine": "drake", "trials": 6, "processes": 1, "seed": seed} | options
+        return evaluate("zero", "high_jump", parts=tmp_path / "out.parts", **options)
+
+    monkeypatch.setattr(module, "play_share", counted)
+    with pytest.raises(KeyboardInterrupt):
+        again()
+    files = sorted((tmp_path / "out.parts").glob("*.npz"))
+    assert len(files) == 2
+    played.clear()
+    done = []
+    whole = again(progress=lambda n, _: done.append(n))
+    assert len(played) == 1 and done[0] == 4
+    for name, values in drake_trials.trials.items():
+        np.testing.assert_array_equal(whole.trials[name], values, name)
+    assert whole.result["metrics"] == drake_trials.result["metrics"]
+    assert whole.result["substeps"] == drake_trials.result["substeps"]
+    # Of another seed they are no part; one that was cut off is played again.
+    played.clear()
+    with pytest.raises(KeyboardInterrupt):
+        again(seed=1)
+    assert len(played) == 2
+    files[0].write_bytes(files[0].read_bytes()[:100])
+    played.clear()
+    again()
+    assert len(played) == 1
+    (tmp_path / "out.parts" / "mine.txt").write_text("kept")
+    forget(tmp_path / "out.parts")
+    assert [path.name for path in (tmp_path / "out.parts").iterdir()] == ["mine.txt"]
+    (tmp_path / "out.parts" / "mine.txt").unlink()
+    forget(tmp_path / "out.parts")
+    forget(tmp_path / "out.parts")  # nothing there is no mistake
+    assert not (tmp_path / "out.parts").exists()
