@@ -12,6 +12,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -176,6 +177,7 @@ def run_verify(config: Verify) -> int:
     from olympics_opt.play import asked, print_training_step
     from olympics_opt.report.page import Page, write_page
     from olympics_opt.report.verification import verification_sections
+    from rl.kept_shares import forget
 
     if config.trials < 1:
         raise ValueError(f"trials must be at least 1, not {config.trials}")
@@ -183,7 +185,8 @@ def run_verify(config: Verify) -> int:
         raise ValueError(f"parting-steps must not be negative, not {config.parting_steps}")
     trials = asked(config)
     atomic.prepare(config.out / "report.json")
-    report, recordings = verify(**trials, parting_steps=config.parting_steps)
+    parts = config.out / "drake.parts"
+    report, recordings = verify(**trials, parting_steps=config.parting_steps, parts=parts)
     atomic.write_json(config.out / "report.json", report)
     page = Page(
         f"{config.name.replace('_', ' ').capitalize()}: does the result hold in Drake?",
@@ -194,6 +197,7 @@ def run_verify(config: Verify) -> int:
     print(verdict_text(report))
     print_training_step(config)
     print(f"wrote {path} and {config.out / 'report.json'}")
+    forget(parts)
     return 0 if report["verdict"]["passed"] else 1
 
 
@@ -208,9 +212,11 @@ def verify(
     options: dict[str, Any] | None = None,
     processes: int = 2,
     parting_steps: int = 0,
+    parts: Path | None = None,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Parity table first, then the same trials in the three runs, then ``parting_steps`` control
-    steps of a few worlds from the same states in two (``rl.parting``).
+    steps of a few worlds from the same states in two (``rl.parting``). Finished shares of Drake's
+    trials are kept in ``parts``, and taken from there.
 
     Returns the report as JSON values and one recording per run (the median episode). Stops after
     the parity table when the two models differ. Raises ValueError for an unknown task or option,
@@ -255,6 +261,7 @@ def verify(
             processes=processes,
             record=True,
             label=run,
+            parts=parts,
         )
         report["results"][run] = played.result
         report["options"] = played.result["options"]  # with those of the policy's card

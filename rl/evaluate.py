@@ -110,7 +110,7 @@ def evaluate(
         progress: called with (trials done, trials).
         parts: a folder for the shares of Drake's trials that are finished, so that the same
             evaluation, begun again after it was stopped, goes on (``rl.kept_shares.forget`` removes
-            them); None for none. Trials with recordings are played anew.
+            them); None for none.
 
     Raises ValueError for an unknown task or option and PolicyError for a policy that does not
     fit, RuntimeError for an engine that cannot run here.

@@ -1,7 +1,8 @@
 """Finished shares of a long evaluation, kept in a folder until the whole of it is written.
 
-A share's file is named by all that decides its trials (policy, task, engine, seed, commit,
-versions of the engines), so a share of another evaluation is never taken for one of this.
+A share's files are named by all that decides its trials (policy, task, engine, seed, commit,
+versions of the engines), so a share of another evaluation is never taken for one of this: first
+its recordings, ``NAME-TRIAL.npz``, then, when they are whole, ``NAME.npz``.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 
 from rl import provenance
 from rl.policy import Policy
+from rl.recording import Recording
 from rl.trials import Played, Share
 from warmstart.npz import read_npz, write_npz
 
@@ -36,7 +38,7 @@ class KeptShares:
         }
 
     def find(self, share: Share) -> Played | None:
-        """What a share came to if it is here, whole, and was not to keep recordings."""
+        """What a share came to, if it is here and whole."""
         path = self._path(share)
         if path is None or not path.is_file():
             return None
@@ -46,8 +48,9 @@ class KeptShares:
             trials = {name: table[i] for i, name in enumerate(about["columns"])}
             if table.shape != (len(trials), share.trials):
                 return None
-            return Played(trials=trials, recordings={}, **{k: about[k] for k in _FIGURES})
-        except (ValueError, KeyError, IndexError):
+            recordings = {t: Recording.load(_beside(path, t)) for t in about["recordings"]}
+            return Played(trials, recordings, **{k: about[k] for k in _FIGURES})
+        except (ValueError, KeyError, IndexError, TypeError):
             return None  # not one of ours, or damaged: it is played again
 
     def keep(self, share: Share, played: Played) -> None:
@@ -55,15 +58,22 @@ class KeptShares:
         path = self._path(share)
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
+            for trial, recording in played.recordings.items():
+                recording.save(_beside(path, trial))
             figures = {k: getattr(played, k) for k in _FIGURES}
+            about = figures | {"columns": list(played.trials), "recordings": [*played.recordings]}
             table = np.stack([np.asarray(x, dtype=float) for x in played.trials.values()])
-            write_npz(path, {"table": table}, figures | {"columns": list(played.trials)})
+            write_npz(path, {"table": table}, about)
 
     def _path(self, share: Share) -> Path | None:
-        if self._folder is None or share.record or share.worlds_recorded:
+        if self._folder is None:
             return None
         facts = json.dumps(self._facts | asdict(share), sort_keys=True, default=str)
         return self._folder / f"{hashlib.sha256(facts.encode()).hexdigest()[:24]}.npz"
+
+
+def _beside(path: Path, trial: int) -> Path:
+    return path.with_name(f"{path.stem}-{trial}.npz")
 
 
 def forget(folder: Path) -> None:

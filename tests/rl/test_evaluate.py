@@ -312,14 +312,21 @@ def test_an_evaluation_that_was_stopped_goes_on(drake_trials, tmp_path, monkeypa
         return play(policy, share, report)
 
     def again(seed=0, **options):
-        options = {"engine": "drake", "trials": 6, "processes": 1, "seed": seed} | options
+        options = {
+            "engine": "drake",
+            "trials": 6,
+            "processes": 1,
+            "record": 1,
+            "seed": seed,
+        } | options
         return evaluate("zero", "high_jump", parts=tmp_path / "out.parts", **options)
 
     monkeypatch.setattr(module, "play_share", counted)
     with pytest.raises(KeyboardInterrupt):
         again()
     files = sorted((tmp_path / "out.parts").glob("*.npz"))
-    assert len(files) == 2
+    whole_files = [path for path in files if "-" not in path.stem]
+    assert len(whole_files) == 2 and len(files) == 6  # each with two episodes
     played.clear()
     done = []
     whole = again(progress=lambda n, _: done.append(n))
@@ -328,15 +335,22 @@ def test_an_evaluation_that_was_stopped_goes_on(drake_trials, tmp_path, monkeypa
         np.testing.assert_array_equal(whole.trials[name], values, name)
     assert whole.result["metrics"] == drake_trials.result["metrics"]
     assert whole.result["substeps"] == drake_trials.result["substeps"]
+    np.testing.assert_array_equal(whole.median.qpos, drake_trials.median.qpos)
+    assert whole.best.metrics == pytest.approx(drake_trials.best.metrics, nan_ok=True)
+    assert whole.best.meta == drake_trials.best.meta
     # Of another seed they are no part; one that was cut off is played again.
     played.clear()
     with pytest.raises(KeyboardInterrupt):
         again(seed=1)
     assert len(played) == 2
-    files[0].write_bytes(files[0].read_bytes()[:100])
+    for path in (
+        whole_files[0],
+        next(p for p in files if p.stem.startswith(f"{whole_files[1].stem}-")),
+    ):
+        path.write_bytes(path.read_bytes()[:100])
     played.clear()
     again()
-    assert len(played) == 1
+    assert len(played) == 2
     (tmp_path / "out.parts" / "mine.txt").write_text("kept")
     forget(tmp_path / "out.parts")
     assert [path.name for path in (tmp_path / "out.parts").iterdir()] == ["mine.txt"]
