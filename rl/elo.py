@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtri
 
 SCALE = 400.0
 """Of the difference that is expected to score 10 to 1."""
@@ -72,7 +72,7 @@ def score(wins: int, draws: int, losses: int) -> Score:
     if games < 1:
         raise ValueError("there are no games to rate")
     mean = (wins + 0.5 * draws) / games
-    z2 = float(stats.norm.ppf(0.975)) ** 2
+    z2 = float(ndtri(0.975)) ** 2
     middle = (mean + z2 / (2 * games)) / (1 + z2 / games)
     half = math.sqrt(z2 * (mean * (1 - mean) / games + z2 / (4 * games * games))) / (1 + z2 / games)
     low = 0.0 if mean == 0.0 else max(0.0, middle - half)
@@ -107,5 +107,5 @@ def fit(scores: np.ndarray, games: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if not len(step) or np.abs(step).max() < 1e-9:
             break
     half = np.zeros(len(games))
-    half[1:] = stats.norm.ppf(0.975) * np.sqrt(np.diag(np.linalg.inv(information)))
+    half[1:] = ndtri(0.975) * np.sqrt(np.diag(np.linalg.inv(information)))
     return ratings, half

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import stats
+from scipy.special import ndtri, stdtrit
 
 from rl import provenance
 from rl.host import RANK_STEP
@@ -201,7 +201,7 @@ def interval(values: np.ndarray, unit: str) -> dict[str, Any]:
         return {"mean": None, "ci95": None, "n": 0, "unit": unit}
     mean = float(x.mean())
     if unit == "fraction" and np.isin(x, (0.0, 1.0)).all():
-        z = float(stats.norm.ppf(0.975))
+        z = float(ndtri(0.975))
         middle = (mean + z * z / (2 * n)) / (1 + z * z / n)
         half = z / (1 + z * z / n) * math.sqrt(mean * (1 - mean) / n + z * z / (4 * n * n))
         # At 0 and 1 the end is exact; rounding must not leave the range.
@@ -210,7 +210,7 @@ def interval(values: np.ndarray, unit: str) -> dict[str, Any]:
         return {"mean": mean, "ci95": [low, high], "n": n, "unit": unit}
     if n == 1 or not np.isfinite(x).all():
         return {"mean": mean if math.isfinite(mean) else None, "ci95": None, "n": n, "unit": unit}
-    half = float(stats.t.ppf(0.975, n - 1)) * float(x.std(ddof=1)) / math.sqrt(n)
+    half = float(stdtrit(n - 1, 0.975)) * float(x.std(ddof=1)) / math.sqrt(n)
     return {"mean": mean, "ci95": [mean - half, mean + half], "n": n, "unit": unit}
 
 
