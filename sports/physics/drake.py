@@ -167,7 +167,7 @@ class DrakePhysics:
             return False
         fine, calm = self._plant, self._calm
         before = fine.state(world)
-        if calm is not None and not calm.soon(*before, self._pos[world], self._lin[world]):
+        if calm is not None and not calm.soon(before[0], self._pos[world], self._lin[world]):
             calm.coarse.set_state(world, *calm.to_coarse(*before))
             if self._advance(calm.coarse, world, targets):
                 fine.set_state(world, *calm.to_fine(*calm.coarse.state(world)))

@@ -59,9 +59,9 @@ class CalmBalls:
             q[height] = there.reach - sunk * (here.stiffness / there.stiffness if sunk > 0 else 1.0)
         return q
 
-    def soon(self, q: np.ndarray, v: np.ndarray, pos: np.ndarray, linvel: np.ndarray) -> bool:
-        """Whether a ball may be touched in the control step to come, or is in a bounce. q, v: the
-        fine plant's state; pos, linvel (B, 3): of links and free objects."""
+    def soon(self, q: np.ndarray, pos: np.ndarray, linvel: np.ndarray) -> bool:
+        """Whether a ball may be touched in the control step to come, or is in a bounce. q: the fine
+        plant's; pos, linvel (B, 3): of links, then of free objects."""
         limbs, speeds = pos[: self._links], linvel[: self._links]
         for k, light in self._balls:
             obj = self._fine.free[k]
