@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+LINE_SECONDS = 60.0
+"""Without a terminal a line is printed this often, where there is something new to say."""
 
 
 class Bar:
     """One line of the display."""
 
     def __init__(self, display, description: str) -> None:
-        self._display = display
+        self._display, self._description = display, description
         self._task = display.add_task(description, total=None, detail="")
+        self._printed = time.monotonic()
 
     def show(self, detail: str, done: float | None = None, total: float | None = None) -> None:
         """Sets the words at the end, and how much of the work is done where that is known."""
         self._display.update(self._task, detail=detail, completed=done, total=total)
+        now = time.monotonic()
+        if not self._display.console.is_terminal and now - self._printed >= LINE_SECONDS:
+            self._printed = now
+            self._display.console.print(f"  {self._description}: {detail}", highlight=False)
 
     def finish(self, detail: str) -> None:
         """Ends the line with what came out."""
@@ -25,7 +34,8 @@ class Bar:
 
 @contextmanager
 def progress(description: str) -> Iterator[Bar]:
-    """Shows a line while the body runs; without a terminal only its final state is printed."""
+    """Shows a line while the body runs; without a terminal its final state is printed, and before
+    that a line each minute."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
