@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 LINE_SECONDS = 60.0
-"""Without a terminal a line is printed this often, where there is something new to say."""
+"""Without a terminal a line is printed at most this often."""
 
 
 class Bar:

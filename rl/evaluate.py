@@ -11,7 +11,7 @@ import math
 import multiprocessing
 import os
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -246,23 +246,47 @@ def _run(
             done += shares[i].trials
         return [played[i] for i in range(len(shares))]
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool:
-        futures = {pool.submit(play_share, policy, shares[i]): i for i in missing}
+    counter = context.Value("i", 0)
+    with ProcessPoolExecutor(
+        workers, mp_context=context, initializer=_begin, initargs=(counter,)
+    ) as pool:
+        futures = {pool.submit(_play_counted, policy, shares[i]): i for i in missing}
+        waiting = set(futures)
         try:
-            for future in as_completed(futures):
-                i = futures[future]
-                played[i] = future.result()
-                parts.keep(shares[i], played[i])
-                done += shares[i].trials
-                report(done, trials)
+            while waiting:
+                ended, waiting = wait(waiting, timeout=1.0, return_when=FIRST_COMPLETED)
+                for future in ended:
+                    i = futures[future]
+                    played[i] = future.result()
+                    parts.keep(shares[i], played[i])
+                report(done + counter.value, trials)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return [played[i] for i in range(len(shares))]
 
 
-def _one_thread() -> None:
+_counter: Any = None
+"""Of a worker: trials done by all of them."""
+
+
+def _begin(counter: Any) -> None:
+    global _counter
+    _counter = counter
     torch.set_num_threads(1)
+
+
+def _play_counted(policy: Policy, share: Share) -> Played:
+    """``play_share`` in a worker, which tells of each trial."""
+    before = 0
+
+    def count(done: int) -> None:
+        nonlocal before
+        with _counter.get_lock():
+            _counter.value += done - before
+        before = done
+
+    return play_share(policy, share, count)
 
 
 def _choose(

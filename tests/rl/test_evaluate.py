@@ -269,7 +269,18 @@ def test_a_recording_keeps_what_its_task_shows(tmp_path):
 def drake_trials():
     """Six trials in Drake, two processes: three shares of two worlds."""
     pytest.importorskip("pydrake")
-    return evaluate("zero", "high_jump", engine="drake", trials=6, processes=2, record=1)
+    done = []
+    played = evaluate(
+        "zero",
+        "high_jump",
+        engine="drake",
+        trials=6,
+        processes=2,
+        record=1,
+        progress=lambda n, total: done.append((n, total)),
+    )
+    assert done == sorted(done) and done[0] == (0, 6) and done[-1] == (6, 6)
+    return played
 
 
 def test_drake_trials_in_processes(drake_trials):
