@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -153,7 +153,8 @@ class Policy:
         assert self.prior is not None
         own = self.metadata["latent"]
         if getattr(env, "layer", None) is not None:
-            if env.layer.card != own:
+            # A card that is older than a setting acted as without it.
+            if env.layer.card != asdict(LatentConfig()) | own:
                 raise PolicyError(
                     "the policy acts through another latent prior, or in another way, than this "
                     "run: give the run the prior and the --latent options of the policy"

@@ -10,16 +10,19 @@ its last layer is made to ask for the same joint angles.
 One that acts through a latent prior may also begin another body's task, where the athlete is its
 own with fingers (``rl.prior_body``). What it read of a link it reads of the same; of a hand that is
 wrist and fingers there, of the wrist, which turns alike and is near, so that it plays nearly as
-before.
+before. Numbers that it does not have, an arm's own share and the hands', begin with 0.
 """
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 
 from rl.config import TRACKING
+from rl.latent_action import LatentConfig
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError, read_policy
 from rl.prior_body import counterparts
@@ -45,7 +48,7 @@ def load_start(source: str, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
     says the task and layout of the environment.
     Raises PolicyError for a policy that cannot be used.
     """
-    policy = read_policy(source, task)
+    policy = _with_arms_and_hands(read_policy(source, task), env)
     found = policy.metadata["task"]
     if policy.actor is None:
         raise ValueError(f"--init {source} is a baseline: there is nothing to start from")
@@ -56,6 +59,30 @@ def load_start(source: str, env: Any, task: str) -> tuple[Policy, torch.Tensor]:
     policy, unseen = _moved(policy, env, task)
     policy.check(env)
     return policy, unseen
+
+
+def _with_arms_and_hands(policy: Policy, env: Any) -> Policy:
+    """The policy with a 0 for each number of the environment's latent actions that it lacks, and
+    as it is where it lacks none or acts in another way."""
+    layer, own = getattr(env, "layer", None), policy.metadata.get("latent")
+    if layer is None or policy.actor is None or not isinstance(own, dict):
+        return policy
+    own = asdict(LatentConfig()) | own
+    more = {k: v for k, v in layer.card.items() if own.get(k) != v}
+    if not more or more.keys() - {"arm_residual", "hands"} or any(own[name] for name in more):
+        return policy
+    if own["hands"]:  # an arm's numbers would come before those of the hands
+        return policy
+    weights = dict(policy.actor.state_dict())
+    rows = layer.size - len(weights["head.bias"])
+    weights["head.weight"] = F.pad(weights["head.weight"], (0, 0, 0, rows))
+    weights["head.bias"] = F.pad(weights["head.bias"], (0, rows))
+    card = policy.metadata | {"latent": layer.card, "action_size": layer.size}
+    actor = MLP(card["obs_size"], tuple(card["hidden"]), layer.size, card["activation"])
+    actor.load_state_dict(weights)
+    made = Policy(actor.requires_grad_(False), policy.mean, policy.std, card, prior=policy.prior)
+    made.extra = policy.extra
+    return made
 
 
 def _sees_more(policy: Policy, env: Any) -> bool:

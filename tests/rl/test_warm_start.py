@@ -253,6 +253,34 @@ def test_a_footballer_in_latents_begins_as_an_athlete_with_fingers(tmp_path):
     env.close()
 
 
+def test_numbers_that_a_policy_in_latents_lacks_begin_with_0(tmp_path):
+    """An arm's own share and the hands'; also from a card that is older than these. Whose arm has
+    another share acts in another way."""
+    source, prior = latent_file(tmp_path, "soccer_1v1")
+    card = json.loads(Path(source).with_suffix(".json").read_text())
+    del card["latent"]["hands"]
+    write_json(Path(source).with_suffix(".json"), card)
+    env = make_env("javelin", num_worlds=1)
+    found = []
+    for options in ({}, {"hands": True}, {"hands": True, "arm_residual": 0.3}):
+        config = LatentConfig(**options)
+        env.act_through(LatentActions(prior, config, env.physics.scene, (), env.device))
+        policy, _ = load_start(source, env, "javelin")
+        assert asdict(LatentConfig()) | policy.metadata["latent"] == env.layer.card
+        assert policy.metadata["action_size"] == env.action_size
+        found.append(policy.actor(torch.ones(3, env.obs_size)))
+    plain, hands, both = found
+    assert [x.shape[1] - plain.shape[1] for x in found] == [0, 2, 2 + 12]
+    for x in (hands, both):
+        assert torch.equal(x[:, : plain.shape[1]], plain)
+        assert float(x[:, plain.shape[1] :].abs().max()) == 0.0
+    card["latent"]["arm_residual"] = 0.1
+    write_json(Path(source).with_suffix(".json"), card)
+    with pytest.raises(PolicyError, match="actions"):
+        load_start(source, env, "javelin")
+    env.close()
+
+
 def test_new_features_take_the_statistics_of_what_is_seen_first():
     """Against numpy's mean and variance; known features merge as they always do."""
     g = torch.Generator().manual_seed(0)
