@@ -147,8 +147,9 @@ class LatentActions:
         for hand, fingers in enumerate(hands):
             opens[hand, fingers] = -self._offset[fingers]  # straight is the angle 0
         self._opens = opens
-        self._arm = slice(prior.latent, prior.latent + len(arm))
-        self.size = self._arm.stop + len(hands)
+        self.arm = slice(prior.latent, prior.latent + len(arm))
+        """Of the policy's action, the numbers of the arm's hinges."""
+        self.size = self.arm.stop + len(hands)
         """Numbers of the policy's action: the latent's, then the arm's hinges, then the hands."""
 
     @property
@@ -183,6 +184,6 @@ class LatentActions:
         decoded = self.prior.decode(state, self._latent(state, action))
         if self._seen is not None:
             decoded = self._seen.targets(decoded)
-        arm = torch.tanh(action[..., self._arm].float()) @ self._spread
-        open_ = (action[..., self._arm.stop :].float() - KEEP) / (1.0 - KEEP)
+        arm = torch.tanh(action[..., self.arm].float()) @ self._spread
+        open_ = (action[..., self.arm.stop :].float() - KEEP) / (1.0 - KEEP)
         return self._free * (decoded - self._offset) + arm + open_.clamp(0.0, 1.0) @ self._opens

@@ -71,10 +71,11 @@ def _with_arms_and_hands(policy: Policy, env: Any) -> Policy:
     more = {k: v for k, v in layer.card.items() if own.get(k) != v}
     if not more or more.keys() - {"arm_residual", "hands"} or any(own[name] for name in more):
         return policy
-    if own["hands"]:  # an arm's numbers would come before those of the hands
-        return policy
     weights = dict(policy.actor.state_dict())
-    rows = layer.size - len(weights["head.bias"])
+    size = len(weights["head.bias"])
+    if size not in (layer.arm.start, layer.arm.stop) or own["hands"]:
+        return policy  # of another arm; or the arm's numbers would come before those of the hands
+    rows = layer.size - size
     weights["head.weight"] = F.pad(weights["head.weight"], (0, 0, 0, rows))
     weights["head.bias"] = F.pad(weights["head.bias"], (0, rows))
     card = policy.metadata | {"latent": layer.card, "action_size": layer.size}
