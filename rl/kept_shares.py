@@ -30,12 +30,14 @@ class KeptShares:
 
     def __init__(self, folder: Path | None, policy: Policy) -> None:
         self._folder = folder
-        self._facts: dict[str, Any] = {
-            "policy": policy.metadata["sha256"],
-            "prior": policy.prior.digest if policy.prior is not None else None,
-            "commit": provenance.commit(),
-            "versions": provenance.versions(),
-        }
+        self._facts: dict[str, Any] = {}
+        if folder is not None:
+            self._facts = {
+                "policy": policy.metadata["sha256"],
+                "prior": policy.prior.digest if policy.prior is not None else None,
+                "commit": provenance.commit(),
+                "versions": provenance.versions(),
+            }
 
     def find(self, share: Share) -> Played | None:
         """What a share came to, if it is here and whole."""

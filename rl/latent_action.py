@@ -42,6 +42,12 @@ class LatentConfig:
             raise ValueError("latent: span must be positive, arm_residual lie in [0, pi]")
 
 
+def as_told(card: dict[str, Any]) -> dict[str, Any]:
+    """``LatentActions.card`` as a policy tells it: one that is older than a setting acted as
+    without it."""
+    return asdict(LatentConfig()) | card
+
+
 def arm_dofs(body: Body, tools: tuple[str, ...]) -> list[int]:
     """Indices of the hinges of the arms that hold the ``tools`` (links), from the shoulder blade
     on, fingers left out. Raises ValueError without a tool."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -25,7 +25,7 @@ from rl import pretrained
 from rl.card import card_text
 from rl.checkpoint import CheckpointError, checkpoints, load_checkpoint
 from rl.int8 import fitted, packed, unpacked
-from rl.latent_action import LatentActions, LatentConfig
+from rl.latent_action import LatentActions, LatentConfig, as_told
 from rl.networks import MLP
 from rl.policy_stack import unstacked
 from rl.prior import LatentPrior, PriorError, find_prior
@@ -153,8 +153,7 @@ class Policy:
         assert self.prior is not None
         own = self.metadata["latent"]
         if getattr(env, "layer", None) is not None:
-            # A card that is older than a setting acted as without it.
-            if env.layer.card != asdict(LatentConfig()) | own:
+            if env.layer.card != as_told(own):
                 raise PolicyError(
                     "the policy acts through another latent prior, or in another way, than this "
                     "run: give the run the prior and the --latent options of the policy"

@@ -15,14 +15,13 @@ before. Numbers that it does not have, an arm's own share and the hands', begin 
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 
 from rl.config import TRACKING
-from rl.latent_action import LatentConfig
+from rl.latent_action import as_told
 from rl.networks import MLP
 from rl.policy import Policy, PolicyError, read_policy
 from rl.prior_body import counterparts
@@ -67,7 +66,7 @@ def _with_arms_and_hands(policy: Policy, env: Any) -> Policy:
     layer, own = getattr(env, "layer", None), policy.metadata.get("latent")
     if layer is None or policy.actor is None or not isinstance(own, dict):
         return policy
-    own = asdict(LatentConfig()) | own
+    own = as_told(own)
     more = {k: v for k, v in layer.card.items() if own.get(k) != v}
     if not more or more.keys() - {"arm_residual", "hands"} or any(own[name] for name in more):
         return policy

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sports.physics.drake_objects import GRAVITY, PlantObject, floating
+from sports.physics.base import GRAVITY
+from sports.physics.drake_objects import PlantObject, floating
 from sports.physics.drake_scene import ScenePlant
 from sports.scene import Scene
 

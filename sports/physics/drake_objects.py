@@ -36,6 +36,7 @@ from sports.humanoid.drake_plant import (
     drake_shape,
     link_inertia,
 )
+from sports.physics.base import GRAVITY
 from sports.scene import SceneObject
 
 BOUNCE_LOSS = 1.7
@@ -47,8 +48,6 @@ KICK_LOSS = 1.51
 at 3 to 20 m/s and 1/960 to 1/7680 s: restitution 0.79 to 0.81 where 0.8 is asked for)."""
 KICKED_STIFFNESS = 1e8
 """Of those surfaces (N/m): all of the spring is the ball's."""
-GRAVITY = 9.81
-"""m/s^2, Drake's own"""
 _HELD = "held"
 
 
@@ -96,7 +95,7 @@ def add_object(
         return PlantObject(obj.name, rigid, frame, joint, obj.quat)
     if obj.restitution is not None:
         (sphere,) = obj.shapes
-        stiffness = _ball_stiffness(obj, timestep)
+        stiffness = _ball_stiffness(obj, sphere.mass, timestep)
         sinks = 0.0 if obj.holdable else sphere.mass * GRAVITY / stiffness
         reach = sphere.size[0] + sinks
         own = _add_ball(plant, rigid, obj, stiffness, sinks)
@@ -117,12 +116,12 @@ def add_object(
     return PlantObject(obj.name, rigid, frame, joint, obj.quat, stiffness, reach)
 
 
-def _ball_stiffness(ball: SceneObject, timestep: float) -> float:
-    """N/m with which a ball has its restitution at that time step (s)."""
+def _ball_stiffness(ball: SceneObject, mass: float, timestep: float) -> float:
+    """N/m with which a ball of a mass (kg) has its restitution at that time step (s)."""
     assert ball.restitution is not None
     loss = BOUNCE_LOSS if ball.holdable else KICK_LOSS
     frequency = -math.log(ball.restitution) / (loss * timestep)
-    return sum(shape.mass for shape in ball.shapes) * frequency**2
+    return mass * frequency**2
 
 
 def _add_ball(
