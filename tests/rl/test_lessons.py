@@ -167,6 +167,7 @@ def test_after_a_signal_the_same_command_goes_on(tmp_path):
 STARTS = {
     "hurdling_latent_from_long_jump": str(pretrained.locate("long_jump", "latent-human")),
     "soccer_1v1_latent": str(pretrained.locate("hurdling", "latent-human")),
+    "soccer_2v2_latent": str(pretrained.locate("soccer_1v1", "latent-human")),
 }
 """What plans of ours begin with; the others begin from nothing."""
 
