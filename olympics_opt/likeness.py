@@ -158,7 +158,7 @@ def _measure(
             engine=config.engine,
             strength=config.strength,
             limits=config.limits,
-            progress=lambda done, total: bar.show(f"{done} of {total} trials", done, total),
+            progress=lambda done, total: bar.show(f"{int(done)} of {total} trials", done, total),
         )
         bar.finish(f"{config.trials} trials, {out['seconds']:.0f} s of motion")
     return out

@@ -42,8 +42,8 @@ def run_match(config: Match) -> int:
         raise ValueError("a ladder is not drawn: leave --sheet and --video out")
     with progress(f"{task}, {config.engine}") as bar:
 
-        def show(done: int, total: int) -> None:
-            bar.show(f"{done} of {total} games", done, total)
+        def show(done: float, total: int) -> None:
+            bar.show(f"{int(done)} of {total} games", done, total)
 
         if config.ladder:
             result = play_ladder(names, setting, progress=show)

@@ -122,7 +122,7 @@ def play(
             record=int(record),
             record_worlds=record_worlds,
             processes=processes,
-            progress=lambda done, total: bar.show(f"{done} of {total} trials", done, total),
+            progress=lambda done, total: bar.show(f"{int(done)} of {total} trials", done, total),
             parts=parts,
         )
         metrics = played.result["metrics"]

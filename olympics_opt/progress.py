@@ -25,7 +25,8 @@ class Bar:
         now = time.monotonic()
         if not self._display.console.is_terminal and now - self._printed >= LINE_SECONDS:
             self._printed = now
-            self._display.console.print(f"  {self._description}: {detail}", highlight=False)
+            share = f" ({done / total:.0%})" if done and total and done % 1 else ""
+            self._display.console.print(f"  {self._description}: {detail}{share}", highlight=False)
 
     def finish(self, detail: str) -> None:
         """Ends the line with what came out."""

@@ -37,8 +37,8 @@ DEFAULT_WORLDS = {"mujoco": 250, "warp": 1000, "drake": 2}
 ROUNDS = 7
 """Episodes that each world of a share plays at most, in Drake."""
 
-Progress = Callable[[int, int], None]
-"""(trials done, trials) -> None"""
+Progress = Callable[[float, int], None]
+"""(trials done, trials) -> None. One under way counts as the share of it that has been played."""
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def _run(
                     i = futures[future]
                     played[i] = future.result()
                     parts.keep(shares[i], played[i])
-                report(done + counter.value, trials)
+                report(done + counter.value / 1000, trials)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -267,7 +267,7 @@ def _run(
 
 
 _counter: Any = None
-"""Of a worker: trials done by all of them."""
+"""Of a worker: thousandths of trials done by all of them, whole numbers, so that they add up."""
 
 
 def _begin(counter: Any) -> None:
@@ -280,11 +280,12 @@ def _play_counted(policy: Policy, share: Share) -> Played:
     """``play_share`` in a worker, which tells of each trial."""
     before = 0
 
-    def count(done: int) -> None:
+    def count(done: float) -> None:
         nonlocal before
+        now = int(1000 * done)
         with _counter.get_lock():
-            _counter.value += done - before
-        before = done
+            _counter.value += now - before
+        before = now
 
     return play_share(policy, share, count)
 

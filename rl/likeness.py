@@ -114,7 +114,7 @@ def likeness_of_policy(
     strength: str | None = None,
     limits: str | None = None,
     options: dict[str, Any] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[float, int], None] | None = None,
 ) -> dict[str, Any]:
     """The panel of a policy in a task; it plays ``trials`` episodes with its mean action.
 

@@ -299,7 +299,7 @@ def play_ladder(
         setting = Setting(**{**vars(setting), "strength": _athlete(setting, policies[0]).strength})
     for k, (i, j) in enumerate(pairs):
 
-        def report(done: int, total: int, before: int = k * setting.trials) -> None:
+        def report(done: float, total: int, before: int = k * setting.trials) -> None:
             if progress is not None:
                 progress(before + done, len(pairs) * setting.trials)
 

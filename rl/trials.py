@@ -24,6 +24,12 @@ from sports.starts import START_NOISE
 
 KEEP_ALL = 64
 """A share of more trials keeps its best and its median only."""
+REPORT_STEPS = 30
+"""Control steps after which a trial under way is told of again: a game in Drake takes minutes."""
+
+Report = Callable[[float], None]
+"""Called with the number of trials done. One under way counts as the steps it has come to, as a
+share of the longest."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +70,8 @@ class Played:
     substeps: int
 
 
-def play_share(policy: Policy, share: Share, report: Callable[[int], None] | None = None) -> Played:
-    """Plays one in this process; ``report`` is called with the number of trials done."""
+def play_share(policy: Policy, share: Share, report: Report | None = None) -> Played:
+    """Plays one in this process."""
     with opened(policy, share) as env:
         return play_episodes(policy, share, env, report)
 
@@ -138,6 +144,12 @@ class _Episodes:
         """Whether every world has played its episodes."""
         return bool((self.current >= self.episodes).all())
 
+    def done(self, longest: int) -> float:
+        """Episodes that ended, and the shares of ``longest`` (steps) that the others have come to;
+        it never falls."""
+        playing = self.current < self.episodes
+        return len(self.spans) + float(((self.step - self.began[playing]) / longest).sum())
+
     def add(self, result: StepResult) -> bool:
         """Takes a step in; whether anything ended with it."""
         self.step += 1
@@ -164,7 +176,7 @@ def play_episodes(
     policy: Callable[[Tensor], Tensor],
     share: Share,
     env: Env,
-    report: Callable[[int], None] | None = None,
+    report: Report | None = None,
 ) -> Played:
     """Plays a share in worlds that are ``opened`` already; played again, its starts are others.
     ``policy`` maps observations (N, A, D) to actions."""
@@ -176,8 +188,8 @@ def play_episodes(
         result = env.step(action)
         obs = result.obs
         tape.add(action, result)
-        if played.add(result) and report is not None:
-            report(min(len(played.spans), share.trials))
+        if (played.add(result) or played.step % REPORT_STEPS == 0) and report is not None:
+            report(min(played.done(env.max_steps), share.trials))
     # The last round may be one too many in the last worlds: left out by index, not by outcome.
     trials = {n: x.flatten()[: share.trials] for n, x in played.table.items()}
     physics = env.physics

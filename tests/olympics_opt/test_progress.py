@@ -21,3 +21,13 @@ def test_without_a_terminal_a_line_is_printed_each_minute(capsys, monkeypatch):
         f"playing soccer_1v1, drake: {second} of 200 trials" for second in (60, 120, 180)
     ]
     assert len(lines) == 4 and "success 20%" in lines[3]
+
+
+def test_what_is_under_way_is_told_as_a_share_of_all(capsys, monkeypatch):
+    """Where games take minutes, "0 of 20 trials" alone would look like a program that hangs."""
+    now = [0.0]
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with progress("playing soccer_1v1, drake") as bar:
+        now[0] = 61.0
+        bar.show("0 of 20 trials", 0.5, 20)
+    assert "playing soccer_1v1, drake: 0 of 20 trials (2%)" in capsys.readouterr().out

@@ -96,6 +96,24 @@ def test_result_has_the_schema_and_is_json(played):
     assert all(len(x) == 23 for x in played.trials.values())
 
 
+def test_trials_under_way_are_told_of_too(monkeypatch):
+    monkeypatch.setattr(sys.modules["rl.trials"], "REPORT_STEPS", 1)
+    told = []
+    played = evaluate(
+        "zero",
+        "high_jump",
+        trials=6,
+        num_worlds=3,
+        seed=1,
+        progress=lambda done, total: told.append(done),
+    )
+    steps, longest = played.trials["episode_steps"].reshape(2, 3), get_task("high_jump").max_steps
+    assert told[0] == 0 and told[-1] == 6 and told == sorted(told)
+    # After k steps: each world's first trial is done, or has come to k steps.
+    for k in range(1, int(steps[0].min())):
+        assert told[k] == pytest.approx(3 * k / longest)
+
+
 def test_every_world_counts_as_often_as_another(played):
     """23 trials of 6 worlds: 4 each, the last world's last left out, and both bars in turn."""
     heights = played.trials["bar_height"]
